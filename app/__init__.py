@@ -1,0 +1,1 @@
+"""The service: HTTP in, JSON out, and the lifting pipeline behind it."""

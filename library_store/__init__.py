@@ -1,0 +1,1 @@
+"""p(X | x): poses, cameras, the exemplar library and its nearest-neighbour index."""

@@ -1,0 +1,1 @@
+"""Training of the pose and person networks (needs the ``train`` extra: torch, onnx)."""

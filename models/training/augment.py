@@ -1,0 +1,169 @@
+"""Random views of a labelled crop: the variety that a few thousand photos lack."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from library_store.skeleton import LSP14
+from models.training.dataset import LabelledCrop
+
+MIRROR = np.array(LSP14.mirror)
+CROP_SCALE = 1.25
+"""Side of a canonical crop over the extent of the joints."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A network input and its labels.
+
+    ``image`` (size, size, 3) uint8 BGR; ``joints_px`` (14, 2) float32 in its pixels; ``weight``
+    (14,) trust in the position, 0 outside the crop; ``presence`` (14,) 1 seen, 0 known to be
+    outside the crop, -1 unknown.
+    """
+
+    image: NDArray[np.uint8]
+    joints_px: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    presence: NDArray[np.float32]
+
+
+def crop_matrix(
+    center_px: NDArray[np.float32], side_px: float, angle_rad: float, size: int, flip: bool = False
+) -> NDArray[np.float32]:
+    """(2, 3) affine that maps the square (centre, side, rotation) onto size x size pixels."""
+    scale = size / side_px
+    cos, sin = scale * np.cos(angle_rad), scale * np.sin(angle_rad)
+    linear = np.array([[cos, -sin], [sin, cos]])
+    if flip:
+        linear[0] *= -1
+    shift = (size - 1) / 2 - linear @ center_px
+    return np.concatenate([linear, shift[:, None]], 1).astype(np.float32)
+
+
+def canonical(crop: LabelledCrop, size: int, scale: float = CROP_SCALE) -> Sample:
+    """The upright, centred crop that evaluation uses."""
+    center, extent = crop.extent_px
+    return _warp(crop, crop_matrix(center, extent * scale, 0.0, size), size, False, None)
+
+
+def _warp(
+    crop: LabelledCrop,
+    matrix: NDArray[np.float32],
+    size: int,
+    flip: bool,
+    rng: np.random.Generator | None,
+) -> Sample:
+    border, value = cv2.BORDER_CONSTANT, (0.0, 0.0, 0.0)
+    if rng is not None:
+        border = (cv2.BORDER_CONSTANT, cv2.BORDER_REPLICATE, cv2.BORDER_REFLECT_101)[
+            rng.integers(3)
+        ]
+        value = tuple(rng.uniform(0, 255, 3)) if rng.random() < 0.5 else value
+    shrink = float(np.sqrt(abs(np.linalg.det(matrix[:, :2].astype(np.float64)))))
+    image = cv2.warpAffine(
+        crop.image,
+        matrix,
+        (size, size),
+        flags=cv2.INTER_AREA if shrink < 0.5 else cv2.INTER_LINEAR,
+        borderMode=border,
+        borderValue=value,
+    )
+    joints = crop.joints_px @ matrix[:, :2].T + matrix[:, 2]
+    weight, visible = crop.weight, crop.visible
+    if flip:
+        joints, weight, visible = joints[MIRROR], weight[MIRROR], visible[MIRROR]
+    inside = ((joints >= -0.5) & (joints <= size - 0.5)).all(1)
+    presence = np.where(visible > 0, 1.0, -1.0)
+    presence = np.where((weight > 0) & ~inside, 0.0, presence)
+    return Sample(
+        image,
+        joints.astype(np.float32),
+        np.where(inside, weight, 0).astype(np.float32),
+        presence.astype(np.float32),
+    )
+
+
+def random_view(
+    crop: LabelledCrop, other: LabelledCrop, size: int, rng: np.random.Generator
+) -> Sample:
+    """A random crop, turn, mirror image, occlusion and exposure; ``other`` lends the occluder."""
+    center, extent = crop.extent_px
+    scale = CROP_SCALE * float(np.exp(rng.uniform(np.log(0.85), np.log(1.4))))
+    offset = rng.normal(0, 0.05, 2)
+    if rng.random() < 0.12:  # cut off at a random side
+        scale *= rng.uniform(0.55, 0.9)
+        offset = rng.uniform(-0.3, 0.3, 2)
+    if rng.random() < (0.35 if crop.wild else 0.15):
+        angle = rng.uniform(-np.pi, np.pi)
+    else:
+        angle = float(np.deg2rad(np.clip(rng.normal(0, 25), -70, 70)))
+    flip = bool(rng.random() < 0.5)
+    side = extent * scale
+    matrix = crop_matrix(
+        center + np.asarray(offset, np.float32) * side, side, float(angle), size, flip
+    )
+    sample = _warp(crop, matrix, size, flip, rng)
+    image, presence = sample.image, sample.presence.copy()
+    if rng.random() < 0.35:
+        for _ in range(rng.integers(1, 3)):
+            _occlude(image, sample.joints_px, presence, other.image, rng)
+    return Sample(_expose(image, rng), sample.joints_px, sample.weight, presence)
+
+
+def _occlude(
+    image: NDArray[np.uint8],
+    joints_px: NDArray[np.float32],
+    presence: NDArray[np.float32],
+    other: NDArray[np.uint8],
+    rng: np.random.Generator,
+) -> None:
+    """Paste a patch of another photo (often somebody's limbs), in place."""
+    size = image.shape[0]
+    w, h = (int(v) for v in rng.uniform(0.12, 0.4, 2) * size)
+    x, y = (int(v) for v in rng.uniform(-0.1, 1.0, 2) * size)
+    x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, size), min(y + h, size)
+    if x1 - x0 < 4 or y1 - y0 < 4:
+        return
+    if rng.random() < 0.75 and min(other.shape[:2]) > 24:
+        oh, ow = other.shape[:2]
+        side = int(rng.uniform(0.3, 0.8) * min(oh, ow))
+        ox, oy = rng.integers(0, ow - side + 1), rng.integers(0, oh - side + 1)
+        patch = cv2.resize(other[oy : oy + side, ox : ox + side], (x1 - x0, y1 - y0))
+    else:
+        patch = np.broadcast_to(rng.integers(0, 256, 3).astype(np.uint8), (y1 - y0, x1 - x0, 3))
+    image[y0:y1, x0:x1] = patch
+    under = (joints_px >= (x0, y0)).all(1) & (joints_px <= (x1, y1)).all(1)
+    presence[under & (presence > 0)] = -1  # still inferable, but not to be called seen
+
+
+def _expose(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Exposure, white balance, grey, blur, low resolution, noise and JPEG."""
+    ramp = np.linspace(0, 1, 256, dtype=np.float32)
+    gamma = np.exp(rng.normal(0, 0.25))
+    gain = np.exp(rng.normal(0, 0.2) + rng.normal(0, 0.08, 3))
+    offset = rng.normal(0, 0.05)
+    lut = (ramp[:, None] ** gamma - 0.5) * gain + 0.5 + offset
+    image = cv2.LUT(image, (np.clip(lut, 0, 1) * 255).astype(np.uint8)[None])
+    dice = rng.random(5)
+    if dice[0] < 0.1:
+        image = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
+    if dice[1] < 0.1:
+        image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.5, 2.0))
+    if dice[2] < 0.1:
+        small = max(24, int(image.shape[0] * rng.uniform(0.25, 0.6)))
+        image = cv2.resize(
+            cv2.resize(image, (small, small), interpolation=cv2.INTER_AREA),
+            image.shape[:2],
+            interpolation=cv2.INTER_LINEAR,
+        )
+    if dice[3] < 0.07:
+        noise = rng.normal(0, rng.uniform(3, 14), image.shape)
+        image = np.clip(image + noise, 0, 255).astype(np.uint8)
+    if dice[4] < 0.07:
+        _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 75))])
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    return image

@@ -1,0 +1,139 @@
+"""Labelled person crops in memory: human labels and filtered teacher labels alike.
+
+A dataset folder or tar holds JPEG crops and an ``annotations.json``; two dialects are read:
+human labels (``joints_px`` + ``labelled``) and teacher labels (``mp33_px`` of a 33-landmark teacher
+plus ``cpm14_px``, see ``from_teachers``). Every joint carries a weight, 0 when nothing is known.
+"""
+
+from __future__ import annotations
+
+import json
+import tarfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from library_store.skeleton import HEAD_TOP, LSP14, NECK
+
+MP33_LIMBS = (12, 14, 16, 11, 13, 15, 24, 26, 28, 23, 25, 27)
+"""The teacher's landmarks for joints 2..13 of lsp14, in that order."""
+
+HOLD_OUT_ONE_IN = 7
+
+
+@dataclass(frozen=True)
+class LabelledCrop:
+    """One person. Pixels are the crop's own, centres at integers.
+
+    ``image`` (h, w, 3) uint8 BGR; ``joints_px`` (14, 2) float32; ``weight`` (14,) float32, how far
+    the position is trusted; ``visible`` (14,) float32, 1 where the joint is known to be seen;
+    ``wild`` marks sport poses, which may stand on their heads.
+    """
+
+    name: str
+    group: int
+    image: NDArray[np.uint8]
+    joints_px: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    visible: NDArray[np.float32]
+    wild: bool
+
+    @property
+    def extent_px(self) -> tuple[NDArray[np.float32], float]:
+        """Centre (2,) and longer side of the box around the known joints."""
+        known = self.joints_px[self.weight > 0]
+        low, high = known.min(0), known.max(0)
+        return (low + high) / 2, float((high - low).max())
+
+
+def _members(path: Path) -> Iterator[tuple[str, bytes]]:
+    if path.is_dir():
+        for file in sorted(path.iterdir()):
+            yield file.name, file.read_bytes()
+        return
+    with tarfile.open(path) as tar:
+        for member in tar:
+            stream = tar.extractfile(member)
+            if stream is not None:
+                yield Path(member.name).name, stream.read()
+
+
+def _from_labels(
+    record: dict[str, Any], image: NDArray[np.uint8], group: int
+) -> LabelledCrop | None:
+    labelled = np.asarray(record["labelled"], np.float32)
+    if labelled.sum() < 6:
+        return None
+    return LabelledCrop(
+        name=record["image"],
+        group=group,
+        image=image,
+        joints_px=np.asarray(record["joints_px"], np.float32),
+        weight=labelled,
+        visible=labelled,
+        wild=True,
+    )
+
+
+def _from_teachers(record: dict[str, Any], image: NDArray[np.uint8]) -> LabelledCrop | None:
+    landmarks = np.asarray(record["mp33_px"], np.float32)
+    visibility = np.asarray(record["mp_visibility"], np.float32)[list(MP33_LIMBS)]
+    agreement = np.array([9.0 if v is None else v for v in record["agreement"]], np.float32)
+    joints = np.zeros((LSP14.n_joints, 2), np.float32)
+    weight = np.zeros(LSP14.n_joints, np.float32)
+    visible = np.zeros(LSP14.n_joints, np.float32)
+    joints[2:] = landmarks[list(MP33_LIMBS)]
+    # The two teachers err independently: agreement is the best sign that a label is right.
+    trust = np.where(agreement < 0.25, 1.0, np.where(agreement < 0.6, 0.4, 0.2))
+    weight[2:] = np.clip(visibility, 0.25, 1.0) * trust
+    visible[2:] = ((visibility > 0.5) & (agreement < 0.25)).astype(np.float32)
+    confidence = np.asarray(record["cpm_confidence"], np.float32)
+    shoulders_agree = agreement[[0, 3]].max() < 0.35
+    for joint in (HEAD_TOP, NECK):
+        joints[joint] = record["cpm14_px"][joint]
+        if shoulders_agree and confidence[joint] > 0.3:
+            weight[joint] = confidence[joint]
+            visible[joint] = float(confidence[joint] > 0.5)
+    if weight[2:].sum() < 2.5:
+        return None
+    return LabelledCrop(
+        name=record["image"],
+        group=int(record["photo"]),
+        image=image,
+        joints_px=joints,
+        weight=weight,
+        visible=visible,
+        wild=record["source"].startswith(("sports", "yoga")),
+    )
+
+
+def load(path: Path) -> list[LabelledCrop]:
+    """Read every usable crop of a folder or tar; crops with hardly any label are left out."""
+    images: dict[str, bytes] = {}
+    annotations: dict[str, Any] | None = None
+    for name, data in _members(path):
+        if name == "annotations.json":
+            annotations = json.loads(data)
+        elif name.endswith(".jpg"):
+            images[name] = data
+    if annotations is None:
+        raise FileNotFoundError(f"{path} has no annotations.json")
+    crops: list[LabelledCrop] = []
+    for i, record in enumerate(annotations["images"]):
+        image = cv2.imdecode(np.frombuffer(images[record["image"]], np.uint8), cv2.IMREAD_COLOR)
+        crop = (
+            _from_labels(record, image, i) if "labelled" in record else _from_teachers(record, image)
+        )
+        if crop is not None:
+            crops.append(crop)
+    return crops
+
+
+def held_out(crop: LabelledCrop) -> bool:
+    """Whether the photo a crop was cut from belongs to the held-out part (whole photos at a time)."""
+    return (crop.group * 2654435761 % 2**32) % HOLD_OUT_ONE_IN == 0

@@ -1,0 +1,161 @@
+"""The Convolutional Pose Machine: a dense residual backbone and stage-wise refinement.
+
+All convolutions are dense (no depthwise ones): on CPUs with bf16 or int8 matrix tiles only those
+profit, and elsewhere they cost little more. Every stage emits 14 joint maps and a background map,
+each stage reads the beliefs of the one before (Wei et al. 2016), every stage is supervised.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+BACKGROUND = 1
+
+
+@dataclass(frozen=True)
+class CpmConfig:
+    """Sizes of the network; written into the checkpoint and the model card."""
+
+    n_joints: int = 14
+    width: int = 48
+    blocks: tuple[int, int, int, int] = (1, 2, 3, 2)
+    stage_width: int = 96
+    n_stages: int = 3
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values, for JSON."""
+        return asdict(self)
+
+
+def _conv_bn(c_in: int, c_out: int, k: int = 3, stride: int = 1) -> nn.Sequential:
+    return nn.Sequential(
+        nn.Conv2d(c_in, c_out, k, stride, k // 2, bias=False), nn.BatchNorm2d(c_out)
+    )
+
+
+class Residual(nn.Module):
+    """Two 3x3 convolutions and a shortcut (He et al. 2016), optionally strided."""
+
+    def __init__(self, c_in: int, c_out: int, stride: int = 1) -> None:
+        super().__init__()
+        self.a = _conv_bn(c_in, c_out, 3, stride)
+        self.b = _conv_bn(c_out, c_out)
+        nn.init.zeros_(self.b[1].weight)
+        self.skip = (
+            nn.Identity() if c_in == c_out and stride == 1 else _conv_bn(c_in, c_out, 1, stride)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, c_in, h, w) -> (B, c_out, h / stride, w / stride)."""
+        y: Tensor = self.b(F.relu(self.a(x)))
+        return F.relu(y + self.skip(x))
+
+
+def _chain(c_in: int, c_out: int, n: int, stride: int) -> nn.Sequential:
+    return nn.Sequential(
+        Residual(c_in, c_out, stride), *(Residual(c_out, c_out) for _ in range(n - 1))
+    )
+
+
+def _up2(x: Tensor) -> Tensor:
+    return F.interpolate(x, scale_factor=2.0, mode="nearest")
+
+
+class Backbone(nn.Module):
+    """Image -> features at stride 4 (``width`` channels) and at stride 8 (``stage_width``).
+
+    A residual pyramid down to stride 32 with a top-down path back to stride 8, so that each cell
+    knows the whole body: left and right cannot be told apart locally.
+    """
+
+    def __init__(self, cfg: CpmConfig) -> None:
+        super().__init__()
+        w, s = cfg.width, cfg.stage_width
+        n4, n8, n16, n32 = cfg.blocks
+        # Space-to-depth first: 48 channels fill the matrix tiles that three never would.
+        self.stem = nn.Sequential(nn.PixelUnshuffle(4), _conv_bn(48, w), nn.ReLU())
+        self.c4 = _chain(w, w, n4, 1)
+        self.c8 = _chain(w, 2 * w, n8, 2)
+        self.c16 = _chain(2 * w, 4 * w, n16, 2)
+        self.c32 = _chain(4 * w, 4 * w, n32, 2)
+        self.t16 = _conv_bn(4 * w, s, 1)
+        self.t32 = _conv_bn(4 * w, s, 1)
+        self.t8 = _conv_bn(2 * w, s, 1)
+        self.m16 = Residual(s, s)
+        self.m8 = Residual(s, s)
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, 3, H, W) in [-1, 1] -> ((B, width, H/4, W/4), (B, stage_width, H/8, W/8))."""
+        x4 = self.c4(self.stem(image))
+        x8 = self.c8(x4)
+        x16 = self.c16(x8)
+        x32 = self.c32(x16)
+        y16 = self.m16(F.relu(self.t16(x16) + _up2(self.t32(x32))))
+        return x4, self.m8(F.relu(self.t8(x8) + _up2(y16)))
+
+
+class Stage(nn.Module):
+    """One CPM stage at stride 8: features and the last beliefs -> sharper beliefs.
+
+    The original's stacks of 7x7 convolutions become a small hourglass: the same reach for a
+    fraction of the cost.
+    """
+
+    def __init__(self, cfg: CpmConfig, first: bool) -> None:
+        super().__init__()
+        s, out = cfg.stage_width, cfg.n_joints + BACKGROUND
+        self.enter = _conv_bn(s if first else s + out, s, 1 if first else 3)
+        self.down = Residual(s, s, 2)
+        self.low = Residual(s, s)
+        self.high = Residual(s, s)
+        self.score = nn.Conv2d(s, out, 1)
+        nn.init.normal_(self.score.weight, std=0.01)
+        nn.init.constant_(self.score.bias, -4.0)
+
+    def forward(self, features: Tensor, logits: Tensor | None) -> tuple[Tensor, Tensor]:
+        """-> (hidden features, logits), both at stride 8."""
+        x = features
+        if logits is not None:
+            x = torch.cat([features, torch.sigmoid(logits)], 1)
+        x = F.relu(self.enter(x))
+        x = self.high(x + _up2(self.low(self.down(x))))
+        return x, self.score(x)
+
+
+class ConvolutionalPoseMachine(nn.Module):
+    """Image crop -> one logit map per joint and one for the background, per stage.
+
+    The stages work at stride 8; the last logits are raised to stride 4 with the backbone's fine
+    features for sub-pixel joints.
+    """
+
+    def __init__(self, cfg: CpmConfig) -> None:
+        super().__init__()
+        self.cfg = cfg
+        self.backbone = Backbone(cfg)
+        self.stages = nn.ModuleList(Stage(cfg, first=i == 0) for i in range(cfg.n_stages))
+        w, out = cfg.width, cfg.n_joints + BACKGROUND
+        self.fine_low = _conv_bn(cfg.stage_width, w, 1)
+        self.fine = Residual(w, w)
+        self.fine_score = nn.Conv2d(w, out, 1)
+        nn.init.zeros_(self.fine_score.weight)
+        nn.init.zeros_(self.fine_score.bias)
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """(B, 3, H, W) in [-1, 1] -> logits per stage: (B, 15, H/8, W/8) ..., (B, 15, H/4, W/4)."""
+        x4, features = self.backbone(image)
+        logits: Tensor | None = None
+        every: list[Tensor] = []
+        hidden = features
+        for stage in self.stages:
+            hidden, logits = stage(features, logits)
+            every.append(logits)
+        assert logits is not None
+        up = F.interpolate(logits, scale_factor=2.0, mode="bilinear", align_corners=False)
+        x = self.fine(F.relu(x4 + _up2(self.fine_low(hidden))))
+        every.append(up + self.fine_score(x))
+        return every

@@ -1,0 +1,62 @@
+"""The loss: where is each joint (spatial cross-entropy), and is it there at all (beliefs)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+PRESENCE_WEIGHT = 0.1
+
+
+def gaussian_targets(joints_px: Tensor, cells: int, stride: float, sigma_cells: float) -> Tensor:
+    """(B, J, 2) pixels -> (B, J, cells, cells) maps with peak value 1."""
+    axis = torch.arange(cells, dtype=torch.float32)
+    # The centre of cell c lies at pixel (c + 0.5) * stride - 0.5.
+    at = (joints_px + 0.5) / stride - 0.5
+    gx = torch.exp(-((axis - at[..., :1]) ** 2) / (2 * sigma_cells**2))
+    gy = torch.exp(-((axis - at[..., 1:]) ** 2) / (2 * sigma_cells**2))
+    return gy[..., :, None] * gx[..., None, :]
+
+
+def stage_loss(
+    logits: Tensor, joints_px: Tensor, weight: Tensor, presence: Tensor, size: int, sigma: float
+) -> Tensor:
+    """Loss of one stage's (B, 15, h, w) logits.
+
+    The joint maps' softmax over positions is compared with a Gaussian (weighted by trust in the
+    label); their sigmoid, and the background's, with the Gaussian itself where presence is known.
+    """
+    n_joints = joints_px.shape[1]
+    cells = logits.shape[-1]
+    logits = logits.float()
+    target = gaussian_targets(joints_px, cells, size / cells, sigma)
+    marginal = target.flatten(2)
+    marginal = marginal / marginal.sum(-1, keepdim=True).clamp_min(1e-6)
+    log_p = F.log_softmax(logits[:, :n_joints].flatten(2), -1)
+    where = -(marginal * log_p).sum(-1)
+    where = (where * weight).sum() / weight.sum().clamp_min(1.0)
+
+    seen = (presence > 0).float()[..., None, None] * target
+    known = (presence >= 0).float()
+    belief = F.binary_cross_entropy_with_logits(logits[:, :n_joints], seen, reduction="none")
+    belief = (belief.flatten(2).sum(-1) * known).sum() / known.sum().clamp_min(1.0)
+    whole = (known.sum(1) == n_joints).float()
+    empty = 1 - seen.amax(1)
+    background = F.binary_cross_entropy_with_logits(logits[:, n_joints], empty, reduction="none")
+    background = (background.flatten(1).sum(-1) * whole).sum() / whole.sum().clamp_min(1.0)
+    return where + PRESENCE_WEIGHT * (belief + 0.1 * background)
+
+
+def total_loss(
+    stages: list[Tensor], joints_px: Tensor, weight: Tensor, presence: Tensor, size: int
+) -> Tensor:
+    """Mean over the stages (intermediate supervision), the last, finer one counting double."""
+    terms = [
+        stage_loss(
+            logits, joints_px, weight, presence, size, 1.2 if i == len(stages) - 1 else 0.8
+        )
+        for i, logits in enumerate(stages)
+    ]
+    terms.append(terms[-1])
+    return torch.stack(terms).mean()
