@@ -1,0 +1,146 @@
+"""``manifest.json``: what a library is, how it was built, under which licences, and its checksums.
+
+A library is a directory of
+
+- ``manifest.json``   this file's subject, written last;
+- ``poses.npy``       (P, 14, 3) float32 mm, exemplar frame, grouped by source;
+- ``frames.npy``      (P,) int32, the frame or sample number within the source;
+- ``sources.json``    the sources: kind, name, first pose, number of poses;
+- ``cameras.npy``     (C, 4) float32, :mod:`library_store.cameras`;
+- ``projections.npy`` (E, 2) int32, pose and camera of each exemplar, ascending;
+- ``descriptors.npy`` (E, 28) float32, :mod:`library_store.descriptor`;
+- ``index.*``         the nearest-neighbour index, :mod:`library_store.index`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from library_store.errors import LibraryError
+
+FORMAT = 1
+MANIFEST = "manifest.json"
+CONTENT_FILES = (
+    "poses.npy",
+    "frames.npy",
+    "sources.json",
+    "cameras.npy",
+    "projections.npy",
+    "descriptors.npy",
+)
+"""The files that the same inputs and seed give byte for byte."""
+
+MEND = "delete the directory {directory} and build the library again (`posematch library build`)"
+
+
+@dataclass(frozen=True)
+class Licence:
+    """Where some of a library's poses come from and what may be done with them."""
+
+    source: str
+    licence: str
+    credit: str
+
+
+@dataclass(frozen=True)
+class FileSum:
+    """Size and SHA-256 of a file."""
+
+    bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """The identity card of a library.
+
+    ``sha256`` identifies the content: it is taken over the names and sums of the content files, not
+    of the index, so that two builds of the same library carry the same one. ``build`` holds the
+    parameters the library was built with, ``index`` those of the index, with ``reproducible``
+    saying whether another build would give the same index file.
+    """
+
+    name: str
+    version: str
+    skeleton: str
+    n_poses: int
+    n_cameras: int
+    n_exemplars: int
+    licences: tuple[Licence, ...]
+    build: Mapping[str, Any]
+    index: Mapping[str, Any]
+    files: Mapping[str, FileSum]
+    sha256: str
+
+    def to_json(self) -> str:
+        """The text of ``manifest.json``."""
+        content: dict[str, Any] = {"format": FORMAT}
+        for field in fields(self):
+            content[field.name] = getattr(self, field.name)
+        content["licences"] = [vars(licence) for licence in self.licences]
+        content["files"] = {name: vars(total) for name, total in self.files.items()}
+        return json.dumps(content, indent=2, ensure_ascii=False) + "\n"
+
+
+def content_digest(files: Mapping[str, FileSum]) -> str:
+    """The identity of a library's content, from the sums of its content files."""
+    lines = "".join(f"{files[name].sha256}  {name}\n" for name in sorted(CONTENT_FILES))
+    return hashlib.sha256(lines.encode()).hexdigest()
+
+
+def file_sum(path: Path) -> FileSum:
+    """Size and SHA-256 of the file at ``path``."""
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return FileSum(bytes=path.stat().st_size, sha256=digest)
+
+
+def read_manifest(directory: Path) -> Manifest:
+    """Read and check ``manifest.json``; ``LibraryError`` when there is no whole one."""
+    path = directory / MANIFEST
+    mend = MEND.format(directory=directory)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise LibraryError(
+            f"{path} is missing: there is no pose library in {directory}; "
+            "build one with `posematch library build`"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise LibraryError(f"{path} cannot be read ({error}); {mend}") from error
+    try:
+        if content.pop("format") != FORMAT:
+            raise LibraryError(f"{path} is of another format than {FORMAT}; {mend}")
+        content["licences"] = tuple(Licence(**licence) for licence in content["licences"])
+        content["files"] = {name: FileSum(**total) for name, total in content["files"].items()}
+        manifest = Manifest(**content)
+        consistent = manifest.sha256 == content_digest(manifest.files)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise LibraryError(f"{path} is not a library manifest ({error!r}); {mend}") from error
+    if not consistent:
+        raise LibraryError(
+            f"{path} contradicts itself: its sha256 is not that of its files; {mend}"
+        )
+    return manifest
+
+
+def check_files(directory: Path, manifest: Manifest, *, sums: bool) -> None:
+    """Check presence, size and, with ``sums``, SHA-256 of every file; ``LibraryError`` if wrong."""
+    mend = MEND.format(directory=directory)
+    for name, expected in manifest.files.items():
+        path = directory / name
+        try:
+            size = path.stat().st_size
+            if size != expected.bytes:
+                raise LibraryError(f"{path} has {size} bytes instead of {expected.bytes}; {mend}")
+            if sums and file_sum(path) != expected:
+                raise LibraryError(f"{path} is corrupt: its SHA-256 has changed; {mend}")
+        except FileNotFoundError:
+            raise LibraryError(f"{path} is missing; {mend}") from None
+        except OSError as error:
+            raise LibraryError(f"{path} cannot be read ({error}); {mend}") from error
