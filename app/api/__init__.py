@@ -1,0 +1,1 @@
+"""One router per resource; ``deps`` and ``bodies`` hold what they share."""

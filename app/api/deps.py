@@ -1,0 +1,86 @@
+"""What the routers share: the service's state, the loaded engine, the API key check."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from fastapi import Depends, Request
+
+from app.admission import Admission
+from app.engine import Engine
+from app.errors import NotReadyError, QuotaExceededError, StartupError, UnauthorizedError
+from app.observability import Metrics
+from app.quota import Quota
+from app.settings import Settings
+
+
+@dataclass
+class Service:
+    """The state of one application, kept on ``app.state.service``.
+
+    ``engine`` is None until loaded; ``stopping`` is set when the shutdown begins;
+    ``startup_error`` is why the service has to end before it was ready.
+    """
+
+    settings: Settings
+    metrics: Metrics
+    admission: Admission
+    quota: Quota | None
+    engine: Engine | None = None
+    stopping: bool = False
+    startup_error: StartupError | None = None
+    key_digests: tuple[bytes, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.key_digests = tuple(
+            key_digest(key.get_secret_value()) for key in self.settings.api_keys
+        )
+
+
+def get_service(request: Request) -> Service:
+    """The application's state."""
+    service: Service = request.app.state.service
+    return service
+
+
+ServiceDep = Annotated[Service, Depends(get_service)]
+
+
+def authorise(request: Request, service: ServiceDep) -> None:
+    """Check the API key and its quota, when keys are on.
+
+    Every key is compared, by digests of equal length, so that the time taken tells nothing.
+    """
+    if not service.key_digests:
+        return
+    scheme, _, token = request.headers.get("authorization", "").partition(" ")
+    given = token.strip() if scheme.lower() == "bearer" else request.headers.get("x-api-key", "")
+    digest = key_digest(given)
+    matches = [hmac.compare_digest(digest, key) for key in service.key_digests]
+    if not any(matches):
+        raise UnauthorizedError("give a key as 'Authorization: Bearer KEY' or 'X-API-Key: KEY'")
+    if service.quota is not None:
+        retry_after_s = service.quota.take(digest.hex())
+        if retry_after_s is not None:
+            service.metrics.refused.labels("quota").inc()
+            raise QuotaExceededError(retry_after_s)
+
+
+def get_engine(service: ServiceDep) -> Engine:
+    """The loaded engine; ``NotReadyError`` until there is one, and while shutting down."""
+    if service.stopping:
+        raise NotReadyError("the service is shutting down")
+    if service.engine is None:
+        raise NotReadyError("the service is starting")
+    return service.engine
+
+
+EngineDep = Annotated[Engine, Depends(get_engine)]
+
+
+def key_digest(key: str) -> bytes:
+    """SHA-256 of an API key: what is kept, compared and counted by."""
+    return hashlib.sha256(key.encode("utf-8", "surrogateescape")).digest()

@@ -1,0 +1,95 @@
+"""POST /v1/lift: 2D joints in, 3D out, no photo."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from fastapi import APIRouter, Depends, Request, Response
+from pydantic import ValidationError
+
+from app import schemas
+from app.answers import lift_answer, rounded_timings
+from app.api.bodies import WatchedArrival, read_body
+from app.api.deps import EngineDep, ServiceDep, authorise
+from app.api.problems import describe, describe_ok, invalid_input
+from app.errors import MalformedBodyError
+from app.pipeline import LiftQuery
+from library_store.skeleton import LSP14
+
+router = APIRouter(tags=["lift"], dependencies=[Depends(authorise)])
+
+MAX_LIFT_BODY_BYTES = 2_000_000
+"""256 people of 14 joints, generously indented."""
+
+
+@router.post(
+    "/v1/lift",
+    summary="Lift given 2D joints",
+    response_class=Response,
+    responses=describe_ok(schemas.LiftAnswer, "Everybody, in order.")
+    | describe(400, 401, 408, 413, 422, 429, 503),
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {
+                "application/json": {"schema": {"$ref": "#/components/schemas/LiftRequest"}}
+            },
+        }
+    },
+)
+async def lift_people(request: Request, service: ServiceDep, engine: EngineDep) -> Response:
+    """Joints left out or with confidence 0 are missing; up to 256 people a call."""
+    body = await read_body(
+        request,
+        limit_bytes=min(MAX_LIFT_BODY_BYTES, service.settings.max_body_bytes),
+        timeout_s=service.settings.upload_timeout_s,
+    )
+    request_id = request.state.request_id
+    with WatchedArrival(request.receive) as arrival:
+
+        def work() -> tuple[schemas.LiftAnswer, bytes]:
+            wait_ms = 1e3 * (time.monotonic() - arrival.at_s)
+            wanted = parse_lift_request(body)
+            result = engine.pipeline.lift(query_of(wanted))
+            answer = lift_answer(engine, result, wanted.method, request_id)
+            total_ms = 1e3 * (time.monotonic() - arrival.at_s)
+            timings_ms = {"wait": wait_ms} | answer.timings_ms | {"total": total_ms}
+            answer = answer.model_copy(update={"timings_ms": rounded_timings(timings_ms)})
+            return answer, answer.model_dump_json().encode()
+
+        answer, encoded = await service.admission.run("lift", work, arrival)
+    request.state.timings_ms.update(answer.timings_ms)
+    return Response(encoded, media_type="application/json")
+
+
+def parse_lift_request(body: bytes) -> schemas.LiftRequest:
+    """The request in ``body``; ``MalformedBodyError`` or ``InvalidInputError`` when it is none."""
+    try:
+        return schemas.LiftRequest.model_validate_json(body)
+    except ValidationError as error:
+        if any(item["type"] == "json_invalid" for item in error.errors()):
+            raise MalformedBodyError("the body is not JSON") from error
+        raise invalid_input(error) from None
+
+
+def query_of(wanted: schemas.LiftRequest) -> LiftQuery:
+    """The pipeline's form of a request: arrays in the skeleton's order, 0 where missing."""
+    joints_px = np.zeros((len(wanted.people), LSP14.n_joints, 2))
+    confidence = np.zeros((len(wanted.people), LSP14.n_joints))
+    for row, person in enumerate(wanted.people):
+        for joint in person.joints_2d:
+            column = LSP14.index(joint.name)
+            joints_px[row, column] = joint.x_px, joint.y_px
+            confidence[row, column] = joint.confidence
+    return LiftQuery(
+        width_px=wanted.image.width_px,
+        height_px=wanted.image.height_px,
+        joints_px=joints_px,
+        confidence=confidence,
+        focal_length_px=wanted.focal_length_px,
+        principal_point_px=wanted.principal_point_px,
+        candidates=wanted.candidates,
+        method=wanted.method,
+        subject_height_mm=wanted.subject_height_mm,
+    )

@@ -1,0 +1,227 @@
+"""The ``posematch`` command: serve, library build|info|verify, predict, version."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import typer
+import uvicorn
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from app.answers import poses_answer
+from app.drawing import draw_result
+from app.engine import load_engine, locate_library
+from app.errors import PoseMatchError, RequestError, StartupError
+from app.imaging import decode_photo
+from app.lifting.types import Method
+from app.main import create_app
+from app.observability import configure_logging
+from app.pipeline import PhotoQuery
+from app.schemas import Person, PosesAnswer
+from app.settings import Settings, load_settings
+from app.version import VERSION
+from library_store.build import (
+    BuildSettings,
+    build_library,
+    describe_library,
+    verify_library,
+)
+from library_store.errors import LibraryError
+from library_store.manifest import Manifest
+from library_store.prior import DEFAULT_PRIOR, PosePrior
+
+cli = typer.Typer(
+    help="Photo in, 3D human pose out. Settings are environment variables, POSEMATCH_*.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+library_cli = typer.Typer(help="The exemplar library.", no_args_is_help=True)
+cli.add_typer(library_cli, name="library")
+
+output = Console()
+notices = Console(stderr=True)
+
+
+def main() -> None:
+    """Run the command; an error made on purpose is one line on stderr and exit code 1."""
+    try:
+        cli()
+    except RequestError as error:
+        notices.print(f"[red]error:[/red] {error.detail}", highlight=False, soft_wrap=True)
+        sys.exit(1)
+    except (PoseMatchError, LibraryError) as error:
+        notices.print(f"[red]cannot start:[/red] {error}", highlight=False, soft_wrap=True)
+        sys.exit(1)
+
+
+@contextmanager
+def stage_progress() -> Iterator[Callable[[str, float], None]]:
+    """A bar per stage on stderr; yields the callback that stages report their fraction to."""
+    columns = (TextColumn("{task.description:>24}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=notices) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def report(stage: str, fraction: float) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=1.0)
+            bars.update(tasks[stage], completed=fraction)
+
+        yield report
+
+
+def _build_if_missing(settings: Settings) -> Path:
+    with stage_progress() as report:
+        return locate_library(settings, report)
+
+
+@cli.command()
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address; default POSEMATCH_HOST.")] = None,
+    port: Annotated[int | None, typer.Option(help="Port; default POSEMATCH_PORT.")] = None,
+) -> None:
+    """Build the default library if it is not cached, and serve."""
+    given = {"host": host, "port": port}
+    settings = load_settings(
+        overrides={name: value for name, value in given.items() if value is not None}
+    )
+    _build_if_missing(settings)
+    configure_logging(settings.log_level)
+
+    def stop(_: StartupError) -> None:
+        server.should_exit = True
+
+    app = create_app(settings, on_startup_failure=stop)
+    server = uvicorn.Server(
+        uvicorn.Config(
+            app,
+            host=settings.host,
+            port=settings.port,
+            lifespan="on",
+            ws="none",
+            access_log=False,
+            log_config=None,
+            server_header=False,
+            timeout_keep_alive=settings.keep_alive_s,
+            timeout_graceful_shutdown=settings.shutdown_grace_s,
+        )
+    )
+    with suppress(KeyboardInterrupt):  # uvicorn shuts down in order, then raises it again
+        server.run()
+    if app.state.service.startup_error is not None:
+        raise app.state.service.startup_error
+
+
+@cli.command()
+def predict(
+    photo: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="JPEG, PNG, WebP.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the JSON of the API.")] = False,
+    image: Annotated[
+        Path | None, typer.Option(help="Write a picture of the result here (PNG, JPEG).")
+    ] = None,
+    method: Annotated[str, typer.Option(help="fusion or paper.")] = "fusion",
+    max_people: Annotated[int, typer.Option(min=1, max=10)] = 5,
+    mirrored: Annotated[bool, typer.Option(help="The photo is a mirror image.")] = False,
+) -> None:
+    """Estimate everybody's pose in a photo, without a server."""
+    if method not in ("fusion", "paper"):
+        raise typer.BadParameter("fusion or paper", param_hint="--method")
+    chosen: Method = "paper" if method == "paper" else "fusion"
+    settings = load_settings()
+    _build_if_missing(settings)
+    engine = load_engine(settings)
+    data = photo.read_bytes()
+    query = PhotoQuery(max_people=max_people, method=chosen, mirrored=mirrored)
+    result = engine.pipeline.estimate(data, query)
+    answer = poses_answer(engine, result, chosen, request_id=photo.name)
+    if image is not None:
+        decoded = decode_photo(
+            data, max_pixels=settings.max_pixels, side_px=settings.decode_side_px
+        )
+        if not cv2.imwrite(str(image), draw_result(decoded, result)):
+            raise typer.BadParameter(f"{image} cannot be written", param_hint="--image")
+    if as_json:
+        output.print_json(answer.model_dump_json())
+    else:
+        _print_people(photo, answer)
+
+
+def _print_people(photo: Path, answer: PosesAnswer) -> None:
+    size = f"{answer.image.width_px} x {answer.image.height_px} px"
+    output.print(f"{photo.name}: {size}, {len(answer.people)} people")
+    for number, person in enumerate(answer.people, 1):
+        output.print(_person_table(number, person))
+        for warning in person.warnings:
+            output.print(f"warning: {warning}", style="yellow", highlight=False)
+    spent = ", ".join(f"{stage} {ms:.1f}" for stage, ms in answer.timings_ms.items())
+    output.print(f"ms: {spent}", highlight=False)
+
+
+def _person_table(number: int, person: Person) -> Table:
+    match = person.exemplar
+    title = f"person {number}" + (f": {match.id}, p = {match.probability:.2f}" if match else "")
+    table = Table(title=title, title_justify="left")
+    for heading in ("joint", "x px", "y px", "x mm", "y mm", "z mm"):
+        table.add_column(heading, justify="left" if heading == "joint" else "right")
+    joints_3d = person.joints_3d or (None,) * len(person.joints_2d)
+    for flat, deep in zip(person.joints_2d, joints_3d, strict=True):
+        mm = [f"{v:.0f}" for v in (deep.x_mm, deep.y_mm, deep.z_mm)] if deep else [""] * 3
+        table.add_row(flat.name, f"{flat.x_px:.1f}", f"{flat.y_px:.1f}", *mm)
+    return table
+
+
+@cli.command("version")
+def print_version() -> None:
+    """Print the version."""
+    output.print(VERSION, highlight=False)
+
+
+@library_cli.command("build")
+def build(
+    directory: Annotated[
+        Path | None,
+        typer.Option(help="Build here; default POSEMATCH_LIBRARY_DIR, else the cache."),
+    ] = None,
+    poses: Annotated[int, typer.Option(min=1, help="How many poses to sample.")] = 200_000,
+    seed: Annotated[int, typer.Option(help="Another seed gives other poses.")] = 0,
+) -> None:
+    """Sample a library from the pose prior; in the cache, only if it is not there yet."""
+    settings = load_settings()
+    directory = directory or settings.library_dir
+    if directory is None:
+        if (poses, seed) != (200_000, 0):
+            raise typer.BadParameter("a library of your own needs --directory")
+        directory = _build_if_missing(settings)
+    else:
+        wanted = BuildSettings(name=directory.name, n_poses=poses, seed=seed)
+        with stage_progress() as report:
+            build_library(directory, PosePrior.load(DEFAULT_PRIOR), wanted, report)
+    output.print(str(directory), highlight=False, soft_wrap=True)
+
+
+@library_cli.command("info")
+def print_info() -> None:
+    """Print the manifest of the library that is served."""
+    settings = load_settings()
+    _print_manifest(describe_library(_build_if_missing(settings)))
+
+
+@library_cli.command("verify")
+def verify() -> None:
+    """Check every file of the library that is served against its SHA-256."""
+    settings = load_settings()
+    directory = _build_if_missing(settings)
+    verify_library(directory)
+    output.print(f"{directory}: whole", highlight=False)
+
+
+def _print_manifest(manifest: Manifest) -> None:
+    output.print_json(json.dumps(json.loads(manifest.to_json())))

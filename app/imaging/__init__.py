@@ -1,0 +1,11 @@
+"""From the bytes of a photo to upright BGR pixels.
+
+The header is read first by our own small parsers (``headers``), so that a photo is refused by
+type, by completeness and by pixels before a decoder sees it; ``exif`` reads the orientation and
+the focal length; ``decode`` decodes, at a reduced scale where that suffices, and turns upright.
+"""
+
+from app.imaging.decode import Photo, decode_photo
+from app.imaging.headers import ACCEPTED_TYPES, ImageHeader, read_header
+
+__all__ = ["ACCEPTED_TYPES", "ImageHeader", "Photo", "decode_photo", "read_header"]

@@ -1,0 +1,208 @@
+"""What the service tells its operators: metrics, request ids, JSON logs, Server-Timing."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import sys
+import time
+import uuid
+from collections.abc import Mapping
+from datetime import UTC, datetime
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info
+from prometheus_client.platform_collector import PlatformCollector
+from prometheus_client.process_collector import ProcessCollector
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from app.admission import Admission
+from app.errors import PROBLEM_TYPE_PREFIX
+
+logger = logging.getLogger("posematch")
+access_logger = logging.getLogger("posematch.access")
+
+_REQUEST_ID = re.compile(r"[A-Za-z0-9._:-]{1,64}")
+_SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 1, 2.5)
+
+
+class Metrics:
+    """The Prometheus metrics of one application, in a registry of their own."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        self.requests = Counter(
+            "posematch_requests",
+            "Answered requests",
+            ["route", "method", "status"],
+            registry=self.registry,
+        )
+        self.request_seconds = Histogram(
+            "posematch_request_seconds",
+            "From the request's first byte to the answer's last",
+            ["route"],
+            buckets=_SECONDS,
+            registry=self.registry,
+        )
+        self.stage_seconds = Histogram(
+            "posematch_stage_seconds",
+            "Time spent in each stage of the pipeline",
+            ["stage"],
+            buckets=_SECONDS,
+            registry=self.registry,
+        )
+        self.refused = Counter(
+            "posematch_refused",
+            "Requests refused for want of capacity",
+            ["reason"],
+            registry=self.registry,
+        )
+        self.abandoned = Counter(
+            "posematch_abandoned",
+            "Requests whose client left before their turn",
+            registry=self.registry,
+        )
+        self.people = Histogram(
+            "posematch_people_per_image",
+            "People found in a photo",
+            buckets=(0, 1, 2, 3, 5, 10),
+            registry=self.registry,
+        )
+        self._running = Gauge(
+            "posematch_running", "Requests being computed", registry=self.registry
+        )
+        self._waiting = Gauge(
+            "posematch_waiting", "Requests waiting for a worker", registry=self.registry
+        )
+        self._build = Info("posematch", "What is being served", registry=self.registry)
+        ProcessCollector(registry=self.registry)
+        PlatformCollector(registry=self.registry)
+
+    def watch(self, admission: Admission) -> None:
+        """Read the gauges from ``admission`` whenever the metrics are scraped."""
+        self._running.set_function(lambda: admission.running)
+        self._waiting.set_function(lambda: admission.waiting)
+
+    def describe(self, **labels: str) -> None:
+        """State which version, model and library are served."""
+        self._build.info(labels)
+
+
+def server_timing(timings_ms: Mapping[str, float]) -> str:
+    """The ``Server-Timing`` header (W3C): ``decode;dur=3.1, pose;dur=11.0``."""
+    return ", ".join(f"{stage};dur={spent:.3f}" for stage, spent in timings_ms.items())
+
+
+class RequestContextMiddleware:
+    """Gives each request its id, and each response its headers, metrics and log line.
+
+    The handlers leave stage timings in ``scope["state"]["timings_ms"]``. An exception nothing
+    else handled becomes a 500 that says nothing but the request id; the log has the rest.
+    """
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self._app = app
+        self._metrics = metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one ASGI connection."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        started_s = time.perf_counter()
+        given = Headers(scope=scope).get("x-request-id", "")
+        request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
+        state = scope.setdefault("state", {})
+        state["request_id"] = request_id
+        timings_ms: dict[str, float] = {}
+        state["timings_ms"] = timings_ms
+        status = 0
+
+        async def send_with_headers(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                headers = MutableHeaders(scope=message)
+                headers["X-Request-ID"] = request_id
+                elapsed = {"app": 1e3 * (time.perf_counter() - started_s)}
+                headers["Server-Timing"] = server_timing(timings_ms | elapsed)
+                headers.setdefault("X-Content-Type-Options", "nosniff")
+            await send(message)
+
+        try:
+            await self._app(scope, receive, send_with_headers)
+        except Exception:
+            logger.exception("unhandled error", extra={"request_id": request_id})
+            if status:
+                raise  # the answer has begun; only closing the connection is left
+            await _send_internal_error(request_id, send_with_headers)
+        finally:
+            self._record(scope, status, time.perf_counter() - started_s, request_id)
+
+    def _record(self, scope: Scope, status: int, spent_s: float, request_id: str) -> None:
+        route = getattr(scope.get("route"), "path", "unmatched")
+        method = scope["method"] if scope["method"] in _METHODS else "other"
+        self._metrics.requests.labels(route, method, str(status or 499)).inc()
+        self._metrics.request_seconds.labels(route).observe(spent_s)
+        access_logger.info(
+            "request",
+            extra={
+                "request_id": request_id,
+                "method": scope["method"],
+                "path": scope["path"],
+                "status": status or 499,
+                "duration_ms": round(1e3 * spent_s, 3),
+                "client": (scope.get("client") or ("",))[0],
+            },
+        )
+
+
+_METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
+
+
+async def _send_internal_error(request_id: str, send: Send) -> None:
+    body = json.dumps(
+        {
+            "type": PROBLEM_TYPE_PREFIX + "internal-error",
+            "title": "Internal error",
+            "status": 500,
+            "detail": "something went wrong here; the request id identifies it in our log",
+            "request_id": request_id,
+        }
+    ).encode()
+    headers = [
+        (b"content-type", b"application/problem+json"),
+        (b"content-length", str(len(body)).encode()),
+    ]
+    await send({"type": "http.response.start", "status": 500, "headers": headers})
+    await send({"type": "http.response.body", "body": body})
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object a line: time, level, logger, message and the record's extra fields."""
+
+    _STANDARD = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName"}
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Serialise ``record``; values JSON does not know become their text."""
+        line: dict[str, object] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        line |= {k: v for k, v in record.__dict__.items() if k not in self._STANDARD}
+        line.pop("color_message", None)
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str)
+
+
+def configure_logging(level: str) -> None:
+    """Send every record of ``level`` and above to stderr as JSON lines."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(JsonFormatter())
+    logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+    for name in ("uvicorn", "uvicorn.error"):
+        logging.getLogger(name).handlers.clear()

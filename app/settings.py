@@ -1,0 +1,195 @@
+"""The service's settings: environment variables ``POSEMATCH_*``, checked before anything starts."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, SecretStr, ValidationError, field_validator, model_validator
+from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+
+from app import MAX_DECODABLE_PIXELS
+from app.errors import StartupError
+
+ENV_PREFIX = "POSEMATCH_"
+
+
+def default_cache_dir() -> Path:
+    """Where built libraries are kept: the user's cache, so that every checkout shares it."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "posematch"
+
+
+def available_cores() -> int:
+    """CPU cores this process may use: its affinity, cut by a container's quota."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cores = cores or 1
+    try:
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        cores = min(cores, max(1, round(int(quota) / int(period))))
+    except (OSError, ValueError):
+        pass  # no cgroup v2, or no quota ("max")
+    return cores
+
+
+class Settings(BaseSettings):
+    """All that can be set, each field from the variable POSEMATCH_<NAME>."""
+
+    model_config = SettingsConfigDict(env_prefix=ENV_PREFIX, frozen=True, extra="forbid")
+
+    host: str = Field("127.0.0.1", min_length=1, description="Address to listen on.")
+    port: int = Field(8000, ge=0, le=65535, description="TCP port; 0 takes any free one.")
+    keep_alive_s: int = Field(
+        30, ge=1, le=3600, description="How long an idle connection is kept open."
+    )
+    shutdown_grace_s: int = Field(
+        10, ge=0, le=600, description="How long requests under way may take after SIGTERM."
+    )
+
+    max_body_bytes: int = Field(
+        15_000_000, ge=1_000, le=1_000_000_000, description="Largest accepted body of one photo."
+    )
+    max_batch_images: int = Field(
+        16, ge=1, le=256, description="Most images in one call of /v1/poses/batch."
+    )
+    max_batch_body_bytes: int = Field(
+        60_000_000, ge=1_000, le=1_000_000_000, description="Largest accepted body of a batch."
+    )
+    max_pixels: int = Field(
+        50_000_000,
+        ge=1_000,
+        le=MAX_DECODABLE_PIXELS,
+        description="Most pixels of an image, read from its header before anything is decoded.",
+    )
+    upload_timeout_s: float = Field(
+        20.0, gt=0, le=3600, description="Longest time a body may take to arrive, else 408."
+    )
+    decode_side_px: int = Field(
+        1280,
+        ge=256,
+        le=16384,
+        description="Photos are decoded at a reduced scale (1/2, 1/4, 1/8; JPEG only) as long as "
+        "their longer side keeps at least this many pixels.",
+    )
+
+    workers: int = Field(
+        default_factory=available_cores,
+        ge=1,
+        le=256,
+        description="Threads that compute, each one request at a time; the cores available.",
+    )
+    queue_size: int = Field(
+        16, ge=0, le=10_000, description="Most requests waiting for a worker; more get a 503."
+    )
+    deadline_ms: float = Field(
+        200.0,
+        gt=0,
+        le=600_000,
+        description="A request whose wait for a worker would end its answer later than this after "
+        "its last body byte is refused with a 503. With a worker free, none is refused.",
+    )
+
+    cache_dir: Path = Field(
+        default_factory=default_cache_dir,
+        description="Where the default library is built on first start and kept.",
+    )
+    library_dir: Path | None = Field(
+        None, description="A built library to serve instead of the default one."
+    )
+    exact_index: bool = Field(
+        False, description="Search the library exhaustively instead of with its HNSW index."
+    )
+    shortlist: int = Field(
+        30, ge=1, le=1000, description="Exemplars per person that are resectioned (eq. 4's k)."
+    )
+    weights_dir: Path = Field(
+        Path(__file__).resolve().parent.parent / "models" / "weights",
+        description="Directory of the networks' ONNX files and model cards.",
+    )
+    model: str = Field("cpm", min_length=1, description="Name of the pose network to serve.")
+
+    api_keys: Annotated[tuple[SecretStr, ...], NoDecode] = Field(
+        (),
+        description="Comma-separated keys; when there are any, /v1 wants one of them as "
+        "'Authorization: Bearer KEY' or 'X-API-Key: KEY'.",
+    )
+    quota_per_minute: int | None = Field(
+        None, ge=1, description="Requests a minute each API key may make; more get a 429."
+    )
+    cors_origins: Annotated[tuple[str, ...], NoDecode] = Field(
+        (), description="Comma-separated origins whose pages may call the API from a browser."
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        "info", description="Least severe log records written (JSON lines on stderr)."
+    )
+
+    @field_validator("api_keys", "cors_origins", mode="before")
+    @classmethod
+    def _split_commas(cls, value: Any) -> Any:
+        if isinstance(value, str):
+            return tuple(part.strip() for part in value.split(",") if part.strip())
+        return value
+
+    @field_validator("api_keys")
+    @classmethod
+    def _long_enough(cls, keys: tuple[SecretStr, ...]) -> tuple[SecretStr, ...]:
+        if any(len(key.get_secret_value()) < 16 for key in keys):
+            raise ValueError("an API key needs at least 16 characters")
+        return keys
+
+    @field_validator("cors_origins")
+    @classmethod
+    def _are_origins(cls, origins: tuple[str, ...]) -> tuple[str, ...]:
+        for origin in origins:
+            scheme, _, rest = origin.partition("://")
+            if origin != "*" and (scheme not in {"http", "https"} or not rest or "/" in rest):
+                raise ValueError(f"{origin!r} is not an origin like https://example.org")
+        return origins
+
+    @model_validator(mode="after")
+    def _fit_together(self) -> Self:
+        if self.quota_per_minute is not None and not self.api_keys:
+            raise ValueError("quota_per_minute counts per API key: set api_keys too")
+        if self.max_batch_body_bytes < self.max_body_bytes:
+            raise ValueError("max_batch_body_bytes is smaller than max_body_bytes")
+        return self
+
+
+def load_settings(
+    environ: Mapping[str, str] | None = None, overrides: Mapping[str, Any] | None = None
+) -> Settings:
+    """Settings from the environment; ``overrides`` win.
+
+    Raises ``StartupError`` naming every unknown POSEMATCH_* variable or every bad value.
+    """
+    environ = os.environ if environ is None else environ
+    known = {ENV_PREFIX + name.upper() for name in Settings.model_fields}
+    unknown = sorted(key for key in environ if key.upper().startswith(ENV_PREFIX))
+    unknown = [key for key in unknown if key.upper() not in known]
+    if unknown:
+        hints = []
+        for key in unknown:
+            close = difflib.get_close_matches(key.upper(), known, 1)
+            hints.append(key + (f" (did you mean {close[0]}?)" if close else ""))
+        raise StartupError("unknown settings: " + ", ".join(hints))
+    values = {
+        name: environ[key]
+        for name in Settings.model_fields
+        for key in environ
+        if key.upper() == ENV_PREFIX + name.upper()
+    }
+    try:
+        return Settings(**{**values, **(overrides or {})})
+    except ValidationError as error:
+        lines = [
+            f"{_variable(item['loc'])}: {item['msg'].removeprefix('Value error, ')}"
+            for item in error.errors(include_url=False, include_context=False)
+        ]
+        raise StartupError("bad settings: " + "; ".join(lines)) from error
+
+
+def _variable(location: tuple[int | str, ...]) -> str:
+    return ENV_PREFIX + str(location[0]).upper() if location else "settings"

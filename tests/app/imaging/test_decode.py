@@ -1,0 +1,281 @@
+"""Decoding: orientations, reduced scales, formats, refusals; against OpenCV's own encoders."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from app.errors import TooManyPixelsError, UndecodableImageError, UnsupportedImageTypeError
+from app.imaging import decode_photo, read_header
+from app.imaging.exif import read_exif
+
+Image = npt.NDArray[np.uint8]
+LIMITS = {"max_pixels": 50_000_000, "side_px": 1280}
+
+# EXIF orientation -> what the camera stored, given the upright image (EXIF 2.32, table 6).
+STORED = {
+    1: lambda a: a,
+    2: lambda a: a[:, ::-1],
+    3: lambda a: a[::-1, ::-1],
+    4: lambda a: a[::-1],
+    5: lambda a: a.swapaxes(0, 1),
+    6: lambda a: np.rot90(a),
+    7: lambda a: a.swapaxes(0, 1)[::-1, ::-1],
+    8: lambda a: np.rot90(a, -1),
+}
+
+
+def scene(height: int = 96, width: int = 160) -> Image:
+    """A smooth picture without symmetry, so that JPEG keeps it and no flip leaves it unchanged."""
+    y, x = np.mgrid[:height, :width] / max(height, width)
+    channels = [200 * x + 20, 200 * y + 40 * np.sin(6 * x), 120 + 100 * np.cos(5 * x * y + x)]
+    return np.stack(channels, -1).clip(0, 255).astype(np.uint8)
+
+
+def encode(image: npt.NDArray[np.generic], extension: str, *flags: int) -> bytes:
+    done, data = cv2.imencode(extension, np.ascontiguousarray(image), flags)
+    assert done
+    return data.tobytes()
+
+
+def tiff(orientation: int, focal_35mm: int = 0, size: tuple[int, int] = (0, 0)) -> bytes:
+    """A little-endian TIFF block with the tags the service reads."""
+    details = [(0xA002, 4, size[0]), (0xA003, 4, size[1]), (0xA405, 3, focal_35mm)]
+    main = [(0x0112, 3, orientation), (0x8769, 4, 8 + 2 + 2 * 12 + 4)]
+    block = b"II*\x00" + struct.pack("<I", 8)
+    for directory in (main, details):
+        block += struct.pack("<H", len(directory))
+        for tag, kind, value in directory:
+            block += struct.pack("<HHI", tag, kind, 1) + struct.pack("<I", value)
+        block += struct.pack("<I", 0)
+    return block
+
+
+def with_exif(jpeg: bytes, block: bytes) -> bytes:
+    segment = b"Exif\x00\x00" + block
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:]
+
+
+def png_chunk(name: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+
+
+def png_with_exif(png: bytes, block: bytes) -> bytes:
+    return png[:33] + png_chunk(b"eXIf", block) + png[33:]
+
+
+def webp_with_exif(webp: bytes, block: bytes, width: int, height: int) -> bytes:
+    canvas = b"\x08\x00\x00\x00" + (width - 1).to_bytes(3, "little")
+    canvas += (height - 1).to_bytes(3, "little")
+    chunks = b"VP8X" + struct.pack("<I", 10) + canvas + webp[12:]
+    chunks += b"EXIF" + struct.pack("<I", len(block)) + block + b"\x00" * (len(block) & 1)
+    return b"RIFF" + struct.pack("<I", 4 + len(chunks)) + b"WEBP" + chunks
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("kind", ["jpeg", "png", "webp"])
+def test_every_orientation_is_turned_upright(orientation: int, kind: str) -> None:
+    upright = scene()
+    stored = STORED[orientation](upright)
+    block = tiff(orientation)
+    if kind == "jpeg":
+        data = with_exif(encode(stored, ".jpg", cv2.IMWRITE_JPEG_QUALITY, 95), block)
+    elif kind == "png":
+        data = png_with_exif(encode(stored, ".png"), block)
+    else:
+        webp = encode(stored, ".webp", cv2.IMWRITE_WEBP_QUALITY, 95)
+        data = webp_with_exif(webp, block, stored.shape[1], stored.shape[0])
+    photo = decode_photo(data, **LIMITS)
+    assert photo.orientation == orientation
+    assert (photo.width_px, photo.height_px) == (160, 96)
+    assert np.abs(photo.pixels_bgr.astype(int) - upright).mean() < 4
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("reduction", [1, 2, 4, 8])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_reduced_photo_knows_where_its_pixels_are(
+    orientation: int, reduction: int, mirrored: bool
+) -> None:
+    """A blob is found at the same full-size place at every scale, also on sizes not divisible."""
+    height, width, where = 611, 843, np.array([301.0, 222.0])
+    y, x = np.mgrid[:height, :width]
+    blob = 230 * np.exp(-((x - where[0]) ** 2 + (y - where[1]) ** 2) / (2 * 20.0**2))
+    upright = np.repeat(blob[..., None], 3, 2).astype(np.uint8)
+    data = with_exif(encode(STORED[orientation](upright), ".jpg"), tiff(orientation))
+    photo = decode_photo(data, max_pixels=10**7, side_px=width // reduction)
+    assert photo.reduction == reduction
+    expected = where
+    if mirrored:
+        photo = photo.mirrored()
+        expected = np.array([width - 1 - where[0], where[1]])
+    weights = photo.pixels_bgr[..., 0].astype(float)
+    weights[weights < 12] = 0
+    rows, columns = np.indices(weights.shape)
+    centre = np.array([(weights * columns).sum(), (weights * rows).sum()]) / weights.sum()
+    found = centre * photo.reduction + photo.offset_px
+    # The blob's faint rim is cut off on whole pixels, which are coarse at 1/8.
+    np.testing.assert_allclose(found, expected, atol=max(0.15, 0.05 * reduction))
+
+
+def test_a_given_box_keeps_its_resolution() -> None:
+    data = encode(scene(2000, 3000), ".jpg")
+    assert decode_photo(data, **LIMITS).reduction == 2
+    near = decode_photo(data, **LIMITS, box_px=(0, 0, 300, 500))
+    assert near.reduction == 1
+    far = decode_photo(data, **LIMITS, box_px=(0, 0, 1000, 1900))
+    assert far.reduction == 4
+
+
+@pytest.mark.parametrize("extension", [".jpg", ".png", ".webp"])
+@pytest.mark.parametrize("size", [(1, 1), (1, 2000), (2000, 1), (7, 5)])
+def test_odd_sizes(extension: str, size: tuple[int, int]) -> None:
+    photo = decode_photo(encode(scene(*size), extension), **LIMITS)
+    assert photo.pixels_bgr.shape == (*size, 3)
+
+
+def test_sixteen_bits_grey_and_alpha() -> None:
+    colour = scene()
+    deep = colour.astype(np.uint16) * 257
+    assert np.array_equal(decode_photo(encode(deep, ".png"), **LIMITS).pixels_bgr, colour)
+    grey = decode_photo(encode(colour[..., 0], ".png"), **LIMITS).pixels_bgr
+    assert np.array_equal(grey, np.repeat(colour[..., :1], 3, 2))
+    alpha = np.zeros(colour.shape[:2], np.uint8)
+    alpha[:, 80:] = 255
+    for extension in (".png", ".webp"):
+        flags = (cv2.IMWRITE_WEBP_QUALITY, 101) if extension == ".webp" else ()
+        cut_out = encode(np.dstack([colour, alpha]), extension, *flags)
+        pixels = decode_photo(cut_out, **LIMITS).pixels_bgr
+        assert (pixels[:, :80] == 255).all(), "transparent pixels are white"
+        assert np.array_equal(pixels[:, 80:], colour[:, 80:])
+    deep_cut_out = encode(np.dstack([deep, alpha.astype(np.uint16) * 257]), ".png")
+    assert (decode_photo(deep_cut_out, **LIMITS).pixels_bgr[:, :80] == 255).all()
+
+
+def test_the_first_frame_of_an_animation() -> None:
+    frames = [scene(), 255 - scene()]
+    animation = cv2.Animation()
+    animation.frames = [np.dstack([f, np.full(f.shape[:2], 255, np.uint8)]) for f in frames]
+    animation.durations = [100, 100]
+    for extension in (".png", ".webp"):
+        done, data = cv2.imencodeanimation(extension, animation)
+        assert done
+        pixels = decode_photo(data.tobytes(), **LIMITS).pixels_bgr
+        assert np.abs(pixels.astype(int) - frames[0]).mean() < 8
+
+
+@pytest.mark.parametrize("extension", [".jpg", ".png", ".webp"])
+def test_every_truncation_is_refused(extension: str) -> None:
+    whole = encode(scene(), extension)
+    read_header(whole)
+    for percent in range(1, 100):
+        cut = whole[: max(12, len(whole) * percent // 100)]
+        with pytest.raises(UndecodableImageError):
+            decode_photo(cut, **LIMITS)
+
+
+def test_a_truncated_progressive_jpeg_is_refused() -> None:
+    whole = encode(scene(), ".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+    decode_photo(whole, **LIMITS)
+    with pytest.raises(UndecodableImageError):
+        decode_photo(whole[:-400], **LIMITS)
+
+
+def test_bytes_after_the_end_are_ignored() -> None:
+    for extension in (".jpg", ".png", ".webp"):
+        decode_photo(encode(scene(), extension) + b"<script>GIF89a\xff\xd8", **LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("data", "name"),
+    [
+        (b"GIF89a" + bytes(40), "GIF"),
+        (b"%PDF-1.7\n", "PDF"),
+        (b'<?xml version="1.0"?><svg xmlns="http://www.w3.org/2000/svg"/>', "SVG"),
+        (b"\x00\x00\x00\x18ftypheic\x00\x00\x00\x00mif1heic", "HEIC"),
+        (b"\x00\x00\x00\x1cftypavif\x00\x00\x00\x00", "AVIF"),
+        (b"hello there", "text"),
+        (b"\xff\xd8", None),
+        (bytes(range(128, 256)), None),
+    ],
+)
+def test_other_types_are_named(data: bytes, name: str | None) -> None:
+    with pytest.raises(UnsupportedImageTypeError) as caught:
+        decode_photo(data, **LIMITS)
+    assert "image/jpeg, image/png, image/webp" in caught.value.detail
+    if name:
+        assert name in caught.value.detail
+
+
+def bomb(width: int, height: int) -> bytes:
+    """A 1-bit PNG of very many pixels in few bytes."""
+    header = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
+    rows = zlib.compress(bytes((width // 8 + 1) * 64), 9)
+    chunks = png_chunk(b"IHDR", header) + png_chunk(b"IDAT", rows) + png_chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunks
+
+
+def test_pixels_are_counted_before_decoding() -> None:
+    with pytest.raises(TooManyPixelsError):
+        decode_photo(bomb(20_000, 20_000), **LIMITS)
+    jpeg = bytearray(encode(scene(), ".jpg"))
+    frame = jpeg.find(b"\xff\xc0")
+    jpeg[frame + 5 : frame + 9] = struct.pack(">HH", 60_000, 60_000)
+    with pytest.raises(TooManyPixelsError):
+        decode_photo(bytes(jpeg), **LIMITS)
+
+
+def test_contradicting_sizes_are_refused() -> None:
+    webp = encode(scene(), ".webp", cv2.IMWRITE_WEBP_QUALITY, 90)
+    with pytest.raises(UndecodableImageError):
+        decode_photo(webp_with_exif(webp, tiff(1), 10, 10), **LIMITS)
+    jpeg = encode(scene(), ".jpg")
+    frame = jpeg.find(b"\xff\xc0")
+    length = int.from_bytes(jpeg[frame + 2 : frame + 4], "big") + 2
+    twice = jpeg[: frame + length] + jpeg[frame : frame + length] + jpeg[frame + length :]
+    with pytest.raises(UndecodableImageError):
+        decode_photo(twice, **LIMITS)
+
+
+def test_a_wrong_png_checksum_is_refused() -> None:
+    png = bytearray(encode(scene(), ".png"))
+    png[len(png) // 2] ^= 1
+    with pytest.raises(UndecodableImageError):
+        decode_photo(bytes(png), **LIMITS)
+
+
+def test_many_empty_segments_do_not_take_long() -> None:
+    flood = b"\xff\xd8" + b"\xff\xfe\x00\x02" * 3_000_000
+    with pytest.raises(UndecodableImageError):
+        read_header(flood)
+    with pytest.raises(UndecodableImageError):
+        read_header(b"\xff\xd8\xff" + b"\xff" * 15_000_000)
+
+
+def test_exif_focal_length_holds_for_the_whole_sensor_only() -> None:
+    stated = read_exif(tiff(1, focal_35mm=26, size=(4032, 3024)))
+    focal = stated.focal_length_px(4032, 3024)
+    assert focal == pytest.approx(26 * 5040 / 43.2666, rel=1e-4)
+    assert stated.focal_length_px(1008, 756) == pytest.approx(focal / 4), "scaled"
+    assert stated.focal_length_px(3024, 4032) == pytest.approx(focal), "turned"
+    assert stated.focal_length_px(3024, 3024) is None, "cropped"
+    assert read_exif(tiff(1, focal_35mm=26)).focal_length_px(4032, 3024) is None
+    assert read_exif(tiff(1, focal_35mm=0, size=(40, 30))).focal_length_px(40, 30) is None
+
+
+def test_broken_exif_is_no_exif() -> None:
+    whole = tiff(6, 26, (40, 30))
+    for end in range(len(whole)):
+        read_exif(whole[:end])
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        damaged = bytearray(whole)
+        damaged[rng.integers(len(whole))] = rng.integers(256)
+        exif = read_exif(bytes(damaged))
+        assert 1 <= exif.orientation <= 8
+    assert read_exif(tiff(9)).orientation == 1
