@@ -38,7 +38,8 @@ class PriorSettings:
 
     ``cover_radius`` and ``cover_power`` thin crowded poses (:func:`density_weights`, in the units
     of a part's vector); ``limit_quantile`` is the share of frames each limit may refuse;
-    ``proportion_spread`` widens the lengths' spread over that of the few subjects.
+    ``proportion_spread`` scales the spread of lengths between the few subjects, below 1 because a
+    good part of it is where the joints of each fitted skeleton were put.
     """
 
     seed: int = 0
@@ -47,7 +48,7 @@ class PriorSettings:
     cover_radius: float = 0.3
     cover_power: float = 0.8
     limit_quantile: float = 0.001
-    proportion_spread: float = 1.25
+    proportion_spread: float = 0.7
     coupling: float = 0.5
     lying: float = 0.05
     anyhow: float = 0.02
@@ -84,7 +85,7 @@ def fit_prior(mocap: Mocap, settings: PriorSettings, card: dict[str, object]) ->
     # A component of the legs that no frame claims goes with any upper body.
     together += 1e-6 * upper.weights
     notes = {**card, "settings": asdict(settings), "frames": len(mocap.poses_mm)}
-    return PosePrior(
+    prior = PosePrior(
         legs=legs,
         upper=upper,
         partners=together / together.sum(axis=1, keepdims=True),
@@ -98,6 +99,19 @@ def fit_prior(mocap: Mocap, settings: PriorSettings, card: dict[str, object]) ->
         ),
         sha256="",
     )
+    notes["measured"] = {
+        "mean_log_probability_legs": round(_mean_log_probability(legs, parts.legs), 3),
+        "mean_log_probability_upper": round(_mean_log_probability(upper, parts.upper), 3),
+        "samples_accepted": round(prior.acceptance(20_000, rng), 3),
+    }
+    return prior
+
+
+def _mean_log_probability(mixture: GaussianMixture, samples: Float) -> float:
+    """Mean log density of frames (n, D), crowds and all."""
+    log_joint = mixture.joint_log_probability(samples)
+    top = log_joint.max(axis=1)
+    return float((top + np.log(np.exp(log_joint - top[:, None]).sum(axis=1))).mean())
 
 
 def _both(parts: BodyParts) -> Float:
@@ -131,7 +145,7 @@ def _fit_lengths(mocap: Mocap, spread: float) -> tuple[Float, GaussianMixture]:
     """Usual lengths (n, 8) mm of each frame's person, and the population of log lengths.
 
     Every subject counts once. With fewer than two dozen subjects the covariance is shrunk halfway
-    to common size plus independent proportions, and its spread widened by ``spread``.
+    to common size plus independent proportions, and the standard deviations scaled by ``spread``.
     """
     measured = measure_lengths(mocap.poses_mm)
     names, of_frame = np.unique(mocap.subjects, return_inverse=True)

@@ -120,8 +120,13 @@ class PosePrior:
                 return np.concatenate(accepted)
         raise RuntimeError(f"the limits of prior {self.card.name} refuse nearly every sample")
 
+    def acceptance(self, n: int, rng: np.random.Generator) -> float:
+        """The share of ``n`` drawn poses that is kept: directions about unit, limits observed."""
+        drawn = self._draw(n, rng)
+        return float(self.limits.allow(drawn).sum() / n)
+
     def _draw(self, n: int, rng: np.random.Generator) -> Float:
-        """About ``n`` poses that are not yet held against the limits."""
+        """At most ``n`` poses that are not yet held against the limits."""
         legs_of = _choose(np.broadcast_to(self.legs.weights, (n, self.legs.n_components)), rng)
         coupled = rng.random(n) < self.coupling
         chances = np.where(coupled[:, None], self.partners[legs_of], self.upper.weights)
