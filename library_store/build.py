@@ -43,7 +43,7 @@ Progress = Callable[[str, float], None]
 RECIPE = 1
 """Raised whenever the code would build another library from the same parameters."""
 
-_CHUNK = 5_000
+_CHUNK = 1_000
 _POSE_GRID_MM = 0.01
 
 
@@ -68,15 +68,21 @@ class BuildSettings:
             raise ValueError("a library needs at least one pose and one camera")
 
 
-def ensure_default_library(cache_dir: Path, progress: Progress | None = None) -> Path:
+def ensure_default_library(
+    cache_dir: Path,
+    progress: Progress | None = None,
+    *,
+    settings: BuildSettings | None = None,
+) -> Path:
     """The directory of the default library in ``cache_dir``, built there first if need be.
 
     Its name carries a digest of the prior and of all parameters, so a new prior or recipe is built
     beside the old library and never mistaken for it. A library with missing or cut files is built
-    again. Takes a minute or two on two cores, once. Raises ``LibraryError``.
+    again. Takes a minute or two on two cores, once; ``settings`` can make it smaller. Raises
+    ``LibraryError``.
     """
     prior = PosePrior.load(DEFAULT_PRIOR)
-    settings = BuildSettings()
+    settings = settings or BuildSettings()
     directory = cache_dir / f"{settings.name}-{build_key(prior, settings)[:12]}"
     if not _is_whole(directory):
         build_library(directory, prior, settings, progress, keep_if=_is_whole)

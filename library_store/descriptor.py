@@ -50,8 +50,9 @@ def normalise(points: ArrayLike, weights: ArrayLike | None = None) -> Float:
         if not np.all(total > 0):
             raise ValueError("a pose needs at least two joints of positive weight")
         share = share / total
-        # NaN coordinates of missing joints must not reach the sums.
-        points = np.where(share[..., None] > 0, points, np.nan_to_num(points, copy=True))
+        # NaN or infinite coordinates of missing joints must not reach the sums.
+        unread = (share[..., None] == 0) & ~np.isfinite(points)
+        points = np.where(unread, 0.0, points)
         centred = points - (share[..., None] * points).sum(axis=-2, keepdims=True)
         radius = np.sqrt((share * (centred**2).sum(axis=-1)).sum(axis=-1))
     if not np.all(radius > 0):

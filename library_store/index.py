@@ -177,7 +177,11 @@ class HnswIndex:
 
 
 def ef_for(n: int) -> int:
-    """Width of the HNSW beam that keeps recall@10 at 0.99 for ``n`` entries (measured)."""
+    """Width of the HNSW beam for ``n`` entries.
+
+    96 at 200,000 entries gave a recall@10 of 1.0 and a recall@30 of 0.998 against exact search on
+    1,500 poses of another capture; at a fixed width recall falls as the library grows.
+    """
     return int(np.clip(96.0 * (n / 200_000.0), 64, 1024))
 
 

@@ -35,7 +35,10 @@ CONTENT_FILES = (
 )
 """The files that the same inputs and seed give byte for byte."""
 
-MEND = "delete the directory {directory} and build the library again (`posematch library build`)"
+MEND = (
+    "delete the directory {directory} and start again: the default library is then built anew, "
+    "another one by `posematch library build`"
+)
 
 
 @dataclass(frozen=True)

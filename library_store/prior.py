@@ -18,6 +18,7 @@ import io
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +99,7 @@ class PosePrior:
                 card=card,
                 sha256=hashlib.sha256(blob).hexdigest(),
             )
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
             raise LibraryError(
                 f"the pose prior {path} (with its card {path.with_suffix('.json').name}) cannot be "
                 f"read: {error}; restore both files from the repository or the package"
@@ -113,7 +114,7 @@ class PosePrior:
         accepted: list[Float] = []
         missing = n
         for _ in range(_ROUNDS):
-            drawn = self._draw(missing + missing // 2 + 8, rng)
+            drawn = self._draw(missing + missing // 4 + 8, rng)
             accepted.append(drawn[self.limits.allow(drawn)][:missing])
             missing -= len(accepted[-1])
             if not missing:

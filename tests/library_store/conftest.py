@@ -1,0 +1,34 @@
+"""One prior and one small library, built once, for all tests of the library."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from library_store.build import BuildSettings, build_library
+from library_store.index import HnswSettings
+from library_store.library import Library, load
+from library_store.prior import PosePrior
+
+SMALL = BuildSettings(name="small", n_poses=4_000, seed=7, index=HnswSettings(threads=1))
+
+
+@pytest.fixture(scope="session")
+def prior() -> PosePrior:
+    return PosePrior.load()
+
+
+@pytest.fixture(scope="session")
+def small_directory(prior: PosePrior, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("libraries") / "small"
+    build_library(directory, prior, SMALL)
+    return directory
+
+
+@pytest.fixture(scope="session")
+def small(small_directory: Path) -> Iterator[Library]:
+    library = load(small_directory)
+    yield library
+    library.close()

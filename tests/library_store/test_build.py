@@ -1,0 +1,303 @@
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from library_store import publish
+from library_store.build import (
+    BuildSettings,
+    build_key,
+    build_library,
+    describe_library,
+    ensure_default_library,
+    verify_library,
+)
+from library_store.errors import LibraryError
+from library_store.index import HnswSettings
+from library_store.library import INDEX_FILE, Library, load
+from library_store.manifest import CONTENT_FILES, MANIFEST
+from library_store.prior import PosePrior
+from tests.library_store.conftest import SMALL
+
+TINY = BuildSettings(name="tiny", n_poses=300, index=HnswSettings(threads=1))
+
+BUILD_AND_STALL = """
+import sys, time
+from pathlib import Path
+from library_store.build import BuildSettings, build_library
+from library_store.prior import PosePrior
+
+def stall(stage, fraction):
+    if stage == sys.argv[2]:
+        print("stalled", flush=True)
+        time.sleep(60)
+
+build_library(Path(sys.argv[1]), PosePrior.load(), BuildSettings("tiny", 300, seed=1), stall)
+"""
+
+BUILD = """
+import sys
+from pathlib import Path
+from library_store.build import BuildSettings, ensure_default_library
+ensure_default_library(Path(sys.argv[1]), settings=BuildSettings("tiny", 300))
+"""
+
+
+@pytest.fixture(scope="module")
+def pristine(prior: PosePrior, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("pristine") / "tiny"
+    build_library(directory, prior, TINY)
+    return directory
+
+
+@pytest.fixture
+def tiny(pristine: Path, tmp_path: Path) -> Path:
+    """A tiny library of the test's own."""
+    return Path(shutil.copytree(pristine, tmp_path / "tiny"))
+
+
+def hidden(directory: Path) -> list[str]:
+    return [path.name for path in directory.parent.glob(".*") if not path.name.endswith(".lock")]
+
+
+def test_two_builds_are_the_same_bytes(
+    prior: PosePrior, small: Library, small_directory: Path, tmp_path: Path
+) -> None:
+    again = build_library(tmp_path / "again", prior, SMALL)
+    assert again.sha256 == small.manifest.sha256
+    for name in (*CONTENT_FILES, INDEX_FILE, MANIFEST):
+        assert (tmp_path / "again" / name).read_bytes() == (small_directory / name).read_bytes()
+
+
+def test_the_digest_is_of_the_content_not_of_the_index(
+    prior: PosePrior, tiny: Path, tmp_path: Path
+) -> None:
+    settings = replace(TINY, index=HnswSettings(links=8, threads=1))
+    other = build_library(tmp_path / "other", prior, settings)
+    same = describe_library(tiny)
+    assert other.files[INDEX_FILE] != same.files[INDEX_FILE]
+    assert other.sha256 == same.sha256
+    reseeded = build_library(tmp_path / "other", prior, replace(TINY, seed=1))
+    assert reseeded.sha256 != same.sha256
+
+
+def test_a_smaller_library_is_the_beginning_of_a_larger(tiny: Path, prior: PosePrior) -> None:
+    small = load(tiny)
+    build_library(tiny.parent / "larger", prior, replace(TINY, n_poses=1_200))
+    larger = load(tiny.parent / "larger")
+    entries = np.arange(300)
+    assert_array_equal(small.poses_mm(entries), larger.poses_mm(entries))
+    assert_array_equal(small.descriptors(entries), larger.descriptors(entries))
+    assert small.exemplar_id(299) == larger.exemplar_id(299)
+
+
+def test_several_cameras_see_one_pose(tiny: Path, prior: PosePrior) -> None:
+    manifest = build_library(tiny, prior, replace(TINY, n_poses=100, cameras_per_pose=4))
+    assert (manifest.n_poses, manifest.n_cameras, manifest.n_exemplars) == (100, 400, 400)
+    library = load(tiny)
+    assert_array_equal(library.poses_mm(np.arange(4)), library.poses_mm([0, 0, 0, 0]))
+    rotation, _ = library.cameras([0, 1])
+    assert not np.allclose(rotation[0], rotation[1])
+    ids = [library.exemplar_id(entry) for entry in range(400)]
+    assert len(set(ids)) == 400
+    assert [library.find(name) for name in ids] == list(range(400))
+
+
+def test_progress_names_stages_and_ends(prior: PosePrior, tmp_path: Path) -> None:
+    heard: list[tuple[str, float]] = []
+    build_library(tmp_path / "tiny", prior, TINY, lambda stage, done: heard.append((stage, done)))
+    stages = list(dict.fromkeys(stage for stage, _ in heard))
+    assert stages == ["poses", "descriptors", "index", "checksums"]
+    for stage in stages:
+        fractions = [done for name, done in heard if name == stage]
+        assert fractions == sorted(fractions)
+        assert fractions[-1] == 1.0
+
+
+@pytest.mark.parametrize("stage", ["poses", "index", "checksums"])
+def test_a_build_killed_leaves_the_old_library_whole(stage: str, tiny: Path) -> None:
+    before = describe_library(tiny).sha256
+    builder = subprocess.Popen(
+        [sys.executable, "-c", BUILD_AND_STALL, str(tiny), stage], stdout=subprocess.PIPE
+    )
+    assert builder.stdout is not None
+    assert builder.stdout.readline() == b"stalled\n"
+    builder.send_signal(signal.SIGKILL)
+    builder.wait()
+    builder.stdout.close()
+    assert verify_library(tiny).sha256 == before
+    load(tiny).close()
+    assert len(hidden(tiny)) == 1, "the killed build's directory is still there"
+    build_library(tiny, PosePrior.load(), replace(TINY, seed=1))
+    assert verify_library(tiny).sha256 != before
+    assert hidden(tiny) == [], "and swept by the next build"
+
+
+def test_a_build_that_fails_leaves_the_old_library_whole(tiny: Path, prior: PosePrior) -> None:
+    before = describe_library(tiny).sha256
+
+    def fail(stage: str, _fraction: float) -> None:
+        if stage == "index":
+            raise OSError(28, "No space left on device")
+
+    with pytest.raises(LibraryError, match=r"No space left.*300 MB free"):
+        build_library(tiny, prior, replace(TINY, seed=1), fail)
+    assert verify_library(tiny).sha256 == before
+    assert hidden(tiny) == []
+
+
+def test_readers_keep_the_library_they_opened(tiny: Path, prior: PosePrior) -> None:
+    opened = load(tiny)
+    poses = opened.poses_mm(np.arange(300))
+    build_library(tiny, prior, replace(TINY, seed=1))
+    assert_array_equal(opened.poses_mm(np.arange(300)), poses)
+    assert not np.array_equal(load(tiny).poses_mm(np.arange(300)), poses)
+
+
+def test_two_processes_building_at_once(tmp_path: Path) -> None:
+    builders = [subprocess.Popen([sys.executable, "-c", BUILD, str(tmp_path)]) for _ in range(2)]
+    assert [builder.wait() for builder in builders] == [0, 0]
+    (directory,) = tmp_path.glob("tiny-*")
+    verify_library(directory)
+    assert hidden(directory) == []
+
+
+def test_who_waits_for_another_build_is_told(tiny: Path, prior: PosePrior) -> None:
+    heard: list[str] = []
+    script = "import fcntl,sys,time; f=open(sys.argv[1],'w'); fcntl.flock(f,fcntl.LOCK_EX); "
+    script += "print('locked',flush=True); time.sleep(0.5)"
+    lock = tiny.parent / f".{tiny.name}.lock"
+    holder = subprocess.Popen([sys.executable, "-c", script, str(lock)], stdout=subprocess.PIPE)
+    assert holder.stdout is not None
+    holder.stdout.readline()
+    started = time.monotonic()
+    build_library(tiny, prior, TINY, lambda stage, _done: heard.append(stage))
+    assert time.monotonic() - started > 0.3
+    assert heard[0] == "waiting for another build"
+    holder.wait()
+    holder.stdout.close()
+
+
+def test_the_default_library_is_built_once(tmp_path: Path) -> None:
+    heard: list[str] = []
+
+    def ensure(settings: BuildSettings) -> Path:
+        return ensure_default_library(
+            tmp_path, lambda stage, _done: heard.append(stage), settings=settings
+        )
+
+    first = ensure(TINY)
+    assert heard
+    heard.clear()
+    assert ensure(TINY) == first
+    assert not heard, "nothing was built the second time"
+    (first / "poses.npy").write_bytes(b"cut")
+    assert ensure(TINY) == first
+    verify_library(first)
+    assert ensure(replace(TINY, seed=1)) != first
+    verify_library(first)
+
+
+def test_the_key_covers_everything_the_library_is_made_of(prior: PosePrior) -> None:
+    keys = {
+        build_key(prior, TINY),
+        build_key(replace(prior, sha256="0" * 64), TINY),
+        build_key(prior, replace(TINY, seed=1)),
+        build_key(prior, replace(TINY, n_poses=301)),
+        build_key(prior, replace(TINY, cameras_per_pose=2)),
+        build_key(prior, replace(TINY, index=HnswSettings(links=8))),
+    }
+    assert len(keys) == 6
+
+
+def test_settings_that_make_no_library_are_refused() -> None:
+    with pytest.raises(ValueError, match="must match"):
+        BuildSettings(name="a/b")
+    with pytest.raises(ValueError, match="at least one"):
+        BuildSettings(n_poses=0)
+
+
+def test_a_directory_that_cannot_be_written_is_named(prior: PosePrior, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(LibraryError, match=r"cannot be built.*parent directory is writable"):
+        build_library(tmp_path / "file" / "library", prior, TINY)
+
+
+def test_without_an_atomic_exchange_the_old_is_moved_aside(
+    tiny: Path, prior: PosePrior, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(publish, "_exchange", lambda _one, _other: False)
+    changed = build_library(tiny, prior, replace(TINY, seed=1))
+    assert verify_library(tiny) == changed
+    assert hidden(tiny) == []
+
+
+def truncate(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def flip_a_bit(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+
+
+def remove(path: Path) -> None:
+    path.unlink()
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+@pytest.mark.parametrize("damage", [truncate, flip_a_bit, remove, empty])
+@pytest.mark.parametrize("name", [*CONTENT_FILES, INDEX_FILE])
+def test_a_damaged_file_is_named(name: str, damage: Callable[[Path], None], tiny: Path) -> None:
+    damage(tiny / name)
+    with pytest.raises(LibraryError, match=rf"{name}.*delete the directory {tiny}"):
+        load(tiny)
+    with pytest.raises(LibraryError, match=name):
+        verify_library(tiny)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        "{}",
+        '{"format": 99}',
+        '{"format": 1, "name": "x", "files": {}, "licences": []}',
+    ],
+)
+def test_a_damaged_manifest_is_named(text: str, tiny: Path) -> None:
+    (tiny / MANIFEST).write_text(text)
+    with pytest.raises(LibraryError, match=r"manifest\.json"):
+        load(tiny)
+
+
+def test_a_manifest_that_contradicts_itself_is_refused(tiny: Path) -> None:
+    manifest = describe_library(tiny)
+    (tiny / MANIFEST).write_text(replace(manifest, sha256="0" * 64).to_json())
+    with pytest.raises(LibraryError, match=r"manifest\.json contradicts itself"):
+        load(tiny)
+    (tiny / MANIFEST).write_text(replace(manifest, n_poses=299).to_json())
+    with pytest.raises(LibraryError, match=r"poses\.npy holds \(300, 14, 3\)"):
+        load(tiny)
+
+
+def test_no_library_at_all(tmp_path: Path) -> None:
+    with pytest.raises(LibraryError, match=r"no pose library in .*posematch library build"):
+        load(tmp_path / "nowhere")

@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from library_store.anatomy import LENGTHS, measure_lengths, root_of
+from library_store.errors import LibraryError
+from library_store.fit_prior import Mocap, PriorSettings, fit_prior, read_mocap
+from library_store.limits import measure
+from library_store.mixture_fit import FitSettings
+from library_store.prior import DEFAULT_PRIOR, PosePrior, save_prior
+from library_store.skeleton import LSP14, NECK
+
+
+@pytest.fixture(scope="module")
+def poses(prior: PosePrior) -> np.ndarray:
+    return prior.sample(6000, np.random.default_rng(11))
+
+
+def test_the_same_seed_gives_the_same_people(prior: PosePrior) -> None:
+    first, second = (prior.sample(200, np.random.default_rng(5)) for _ in range(2))
+    assert_array_equal(first, second)
+    assert not np.array_equal(first, prior.sample(200, np.random.default_rng(6)))
+
+
+def test_poses_are_whole_and_rooted(poses: np.ndarray) -> None:
+    assert poses.shape == (6000, 14, 3)
+    assert np.isfinite(poses).all()
+    assert_allclose(root_of(poses), 0.0, atol=1e-9)
+
+
+def test_people_have_human_proportions(poses: np.ndarray) -> None:
+    lengths = dict(zip(LENGTHS, measure_lengths(poses).T, strict=True))
+    expected_mm = {
+        "trunk": (430, 650),
+        "hips": (110, 260),
+        "shoulder": (120, 260),
+        "head": (190, 320),
+        "upper_arm": (230, 350),
+        "forearm": (200, 350),
+        "thigh": (330, 490),
+        "shank": (350, 520),
+    }
+    for name, (low, high) in expected_mm.items():
+        inside = (lengths[name] > low) & (lengths[name] < high)
+        assert inside.mean() > 0.98, name
+    assert 0.85 < np.median(lengths["thigh"] / lengths["shank"]) < 1.05
+
+
+def test_left_and_right_are_alike(poses: np.ndarray) -> None:
+    mirrored = poses[:, LSP14.mirror] * (-1.0, 1.0, 1.0)
+    spread = poses.std(axis=0)
+    # 6,000 people: a mean is known to within spread / 77.
+    assert np.all(np.abs(poses.mean(axis=0) - mirrored.mean(axis=0)) < 0.1 * spread + 1e-9)
+    assert_allclose(measure(poses).mean(axis=0), measure(mirrored).mean(axis=0), atol=0.05)
+
+
+def test_most_people_are_upright_and_some_lie(poses: np.ndarray) -> None:
+    trunk = poses[:, NECK] / np.linalg.norm(poses[:, NECK], axis=1, keepdims=True)
+    tilt = np.degrees(np.arccos(trunk[:, 1]))
+    assert np.mean(tilt < 45) > 0.7
+    assert 0.04 < np.mean(np.abs(tilt - 90) < 30) < 0.25
+    assert np.mean(tilt > 120) < 0.05
+
+
+def test_the_prior_is_small_and_its_card_says_what_it_is(prior: PosePrior) -> None:
+    assert DEFAULT_PRIOR.stat().st_size < 500_000
+    assert "mocap.cs.cmu.edu" in prior.card.licences[0]["credit"]
+    assert prior.card.notes["command"]
+    assert prior.card.notes["measured"]
+
+
+def test_written_and_read_again(prior: PosePrior, tmp_path: Path) -> None:
+    paths = [tmp_path / "one" / "p.npz", tmp_path / "two" / "p.npz"]
+    for path in paths:
+        save_prior(prior, path)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    again = PosePrior.load(paths[0])
+    assert_allclose(
+        again.sample(100, np.random.default_rng(0)), prior.sample(100, np.random.default_rng(0))
+    )
+
+
+@pytest.mark.parametrize("damage", ["truncated", "not a zip", "no card", "bad card", "missing"])
+def test_a_damaged_prior_is_named(damage: str, tmp_path: Path) -> None:
+    path = tmp_path / "cmu.npz"
+    shutil.copy(DEFAULT_PRIOR, path)
+    shutil.copy(DEFAULT_PRIOR.with_suffix(".json"), path.with_suffix(".json"))
+    if damage == "truncated":
+        path.write_bytes(path.read_bytes()[:5000])
+    elif damage == "not a zip":
+        path.write_bytes(b"nothing")
+    elif damage == "no card":
+        path.with_suffix(".json").unlink()
+    elif damage == "bad card":
+        path.with_suffix(".json").write_text(json.dumps({"name": "x"}))
+    else:
+        path.unlink()
+    with pytest.raises(LibraryError, match=r"cmu\.npz"):
+        PosePrior.load(path)
+
+
+def test_limits_that_refuse_everything_do_not_hang(prior: PosePrior) -> None:
+    nobody = replace(prior, limits=replace(prior.limits, low=np.full_like(prior.limits.low, 1e9)))
+    with pytest.raises(RuntimeError, match="refuse nearly every sample"):
+        nobody.sample(2, np.random.default_rng(0))
+
+
+def test_a_prior_fitted_on_its_own_samples(poses: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "mocap.npz"
+    subjects = np.array(["cmu_01", "cmu_02", "cmu_03", "cmu_35"])
+    clip = np.arange(1000) % 4
+    np.savez(path, positions=poses[:1000] + 100.0, clip=clip, clip_subject=subjects)
+    assert len(read_mocap(path).poses_mm) == 1000
+    mocap = read_mocap(path, exclude_subjects=("35",))
+    assert set(mocap.subjects) == {"cmu_01", "cmu_02", "cmu_03"}
+    fit = FitSettings(n_components=12, n_iterations=5)
+    settings = PriorSettings(legs=fit, upper=fit)
+    fitted = fit_prior(mocap, settings, {"name": "tiny", "version": "1", "licences": []})
+    again = fit_prior(
+        Mocap(mocap.poses_mm, mocap.subjects), settings, {"name": "tiny", "version": "1"}
+    )
+    assert_array_equal(fitted.legs.means, again.legs.means)
+    drawn = fitted.sample(500, np.random.default_rng(0))
+    height = np.median(np.linalg.norm(poses[:, NECK], axis=1))
+    assert np.median(np.linalg.norm(drawn[:, NECK], axis=1)) == pytest.approx(height, rel=0.05)
