@@ -168,8 +168,12 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
             place = document["paths"][path]["post"][kind]
             place = place["200"] if kind == "responses" else place
             place["content"][media]["example"] = _read_example(example)
+        # FastAPI's own validation errors, which here are problems like all others.
         for name in ("HTTPValidationError", "ValidationError"):
-            components.pop(name, None)  # ours are problems
+            components.pop(name, None)
+        for operation in (op for path in document["paths"].values() for op in path.values()):
+            if "HTTPValidationError" in json.dumps(operation["responses"].get("422", {})):
+                del operation["responses"]["422"]
         app.openapi_schema = document
     return app.openapi_schema
 

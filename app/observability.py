@@ -69,6 +69,11 @@ class Metrics:
             buckets=(0, 1, 2, 3, 5, 10),
             registry=self.registry,
         )
+        self.far_from_library = Counter(
+            "posematch_far_from_library",
+            "People unlike anything in the library",
+            registry=self.registry,
+        )
         self._running = Gauge(
             "posematch_running", "Requests being computed", registry=self.registry
         )

@@ -11,11 +11,10 @@ import numpy.typing as npt
 import pytest
 
 from app.errors import TooManyPixelsError, UndecodableImageError, UnsupportedImageTypeError
-from app.imaging import decode_photo, read_header
+from app.imaging import Photo, decode_photo, read_header
 from app.imaging.exif import read_exif
 
 Image = npt.NDArray[np.uint8]
-LIMITS = {"max_pixels": 50_000_000, "side_px": 1280}
 
 # EXIF orientation -> what the camera stored, given the upright image (EXIF 2.32, table 6).
 STORED = {
@@ -30,11 +29,22 @@ STORED = {
 }
 
 
+def decode(
+    data: bytes,
+    *,
+    max_pixels: int = 50_000_000,
+    side_px: int = 1280,
+    box_px: tuple[float, float, float, float] | None = None,
+) -> Photo:
+    """``decode_photo`` with the service's own limits."""
+    return decode_photo(data, max_pixels=max_pixels, side_px=side_px, box_px=box_px)
+
+
 def scene(height: int = 96, width: int = 160) -> Image:
     """A smooth picture without symmetry, so that JPEG keeps it and no flip leaves it unchanged."""
     y, x = np.mgrid[:height, :width] / max(height, width)
     channels = [200 * x + 20, 200 * y + 40 * np.sin(6 * x), 120 + 100 * np.cos(5 * x * y + x)]
-    return np.stack(channels, -1).clip(0, 255).astype(np.uint8)
+    return np.asarray(np.stack(channels, -1).clip(0, 255), np.uint8)
 
 
 def encode(image: npt.NDArray[np.generic], extension: str, *flags: int) -> bytes:
@@ -90,7 +100,7 @@ def test_every_orientation_is_turned_upright(orientation: int, kind: str) -> Non
     else:
         webp = encode(stored, ".webp", cv2.IMWRITE_WEBP_QUALITY, 95)
         data = webp_with_exif(webp, block, stored.shape[1], stored.shape[0])
-    photo = decode_photo(data, **LIMITS)
+    photo = decode(data)
     assert photo.orientation == orientation
     assert (photo.width_px, photo.height_px) == (160, 96)
     assert np.abs(photo.pixels_bgr.astype(int) - upright).mean() < 4
@@ -108,7 +118,7 @@ def test_a_reduced_photo_knows_where_its_pixels_are(
     blob = 230 * np.exp(-((x - where[0]) ** 2 + (y - where[1]) ** 2) / (2 * 20.0**2))
     upright = np.repeat(blob[..., None], 3, 2).astype(np.uint8)
     data = with_exif(encode(STORED[orientation](upright), ".jpg"), tiff(orientation))
-    photo = decode_photo(data, max_pixels=10**7, side_px=width // reduction)
+    photo = decode(data, max_pixels=10**7, side_px=width // reduction)
     assert photo.reduction == reduction
     expected = where
     if mirrored:
@@ -125,36 +135,36 @@ def test_a_reduced_photo_knows_where_its_pixels_are(
 
 def test_a_given_box_keeps_its_resolution() -> None:
     data = encode(scene(2000, 3000), ".jpg")
-    assert decode_photo(data, **LIMITS).reduction == 2
-    near = decode_photo(data, **LIMITS, box_px=(0, 0, 300, 500))
+    assert decode(data).reduction == 2
+    near = decode(data, box_px=(0, 0, 300, 500))
     assert near.reduction == 1
-    far = decode_photo(data, **LIMITS, box_px=(0, 0, 1000, 1900))
+    far = decode(data, box_px=(0, 0, 1000, 1900))
     assert far.reduction == 4
 
 
 @pytest.mark.parametrize("extension", [".jpg", ".png", ".webp"])
 @pytest.mark.parametrize("size", [(1, 1), (1, 2000), (2000, 1), (7, 5)])
 def test_odd_sizes(extension: str, size: tuple[int, int]) -> None:
-    photo = decode_photo(encode(scene(*size), extension), **LIMITS)
+    photo = decode(encode(scene(*size), extension))
     assert photo.pixels_bgr.shape == (*size, 3)
 
 
 def test_sixteen_bits_grey_and_alpha() -> None:
     colour = scene()
     deep = colour.astype(np.uint16) * 257
-    assert np.array_equal(decode_photo(encode(deep, ".png"), **LIMITS).pixels_bgr, colour)
-    grey = decode_photo(encode(colour[..., 0], ".png"), **LIMITS).pixels_bgr
+    assert np.array_equal(decode(encode(deep, ".png")).pixels_bgr, colour)
+    grey = decode(encode(colour[..., 0], ".png")).pixels_bgr
     assert np.array_equal(grey, np.repeat(colour[..., :1], 3, 2))
     alpha = np.zeros(colour.shape[:2], np.uint8)
     alpha[:, 80:] = 255
     for extension in (".png", ".webp"):
         flags = (cv2.IMWRITE_WEBP_QUALITY, 101) if extension == ".webp" else ()
         cut_out = encode(np.dstack([colour, alpha]), extension, *flags)
-        pixels = decode_photo(cut_out, **LIMITS).pixels_bgr
+        pixels = decode(cut_out).pixels_bgr
         assert (pixels[:, :80] == 255).all(), "transparent pixels are white"
         assert np.array_equal(pixels[:, 80:], colour[:, 80:])
     deep_cut_out = encode(np.dstack([deep, alpha.astype(np.uint16) * 257]), ".png")
-    assert (decode_photo(deep_cut_out, **LIMITS).pixels_bgr[:, :80] == 255).all()
+    assert (decode(deep_cut_out).pixels_bgr[:, :80] == 255).all()
 
 
 def test_the_first_frame_of_an_animation() -> None:
@@ -165,7 +175,7 @@ def test_the_first_frame_of_an_animation() -> None:
     for extension in (".png", ".webp"):
         done, data = cv2.imencodeanimation(extension, animation)
         assert done
-        pixels = decode_photo(data.tobytes(), **LIMITS).pixels_bgr
+        pixels = decode(data.tobytes()).pixels_bgr
         assert np.abs(pixels.astype(int) - frames[0]).mean() < 8
 
 
@@ -176,19 +186,19 @@ def test_every_truncation_is_refused(extension: str) -> None:
     for percent in range(1, 100):
         cut = whole[: max(12, len(whole) * percent // 100)]
         with pytest.raises(UndecodableImageError):
-            decode_photo(cut, **LIMITS)
+            decode(cut)
 
 
 def test_a_truncated_progressive_jpeg_is_refused() -> None:
     whole = encode(scene(), ".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
-    decode_photo(whole, **LIMITS)
+    decode(whole)
     with pytest.raises(UndecodableImageError):
-        decode_photo(whole[:-400], **LIMITS)
+        decode(whole[:-400])
 
 
 def test_bytes_after_the_end_are_ignored() -> None:
     for extension in (".jpg", ".png", ".webp"):
-        decode_photo(encode(scene(), extension) + b"<script>GIF89a\xff\xd8", **LIMITS)
+        decode(encode(scene(), extension) + b"<script>GIF89a\xff\xd8")
 
 
 @pytest.mark.parametrize(
@@ -206,7 +216,7 @@ def test_bytes_after_the_end_are_ignored() -> None:
 )
 def test_other_types_are_named(data: bytes, name: str | None) -> None:
     with pytest.raises(UnsupportedImageTypeError) as caught:
-        decode_photo(data, **LIMITS)
+        decode(data)
     assert "image/jpeg, image/png, image/webp" in caught.value.detail
     if name:
         assert name in caught.value.detail
@@ -222,31 +232,31 @@ def bomb(width: int, height: int) -> bytes:
 
 def test_pixels_are_counted_before_decoding() -> None:
     with pytest.raises(TooManyPixelsError):
-        decode_photo(bomb(20_000, 20_000), **LIMITS)
+        decode(bomb(20_000, 20_000))
     jpeg = bytearray(encode(scene(), ".jpg"))
     frame = jpeg.find(b"\xff\xc0")
     jpeg[frame + 5 : frame + 9] = struct.pack(">HH", 60_000, 60_000)
     with pytest.raises(TooManyPixelsError):
-        decode_photo(bytes(jpeg), **LIMITS)
+        decode(bytes(jpeg))
 
 
 def test_contradicting_sizes_are_refused() -> None:
     webp = encode(scene(), ".webp", cv2.IMWRITE_WEBP_QUALITY, 90)
     with pytest.raises(UndecodableImageError):
-        decode_photo(webp_with_exif(webp, tiff(1), 10, 10), **LIMITS)
+        decode(webp_with_exif(webp, tiff(1), 10, 10))
     jpeg = encode(scene(), ".jpg")
     frame = jpeg.find(b"\xff\xc0")
     length = int.from_bytes(jpeg[frame + 2 : frame + 4], "big") + 2
     twice = jpeg[: frame + length] + jpeg[frame : frame + length] + jpeg[frame + length :]
     with pytest.raises(UndecodableImageError):
-        decode_photo(twice, **LIMITS)
+        decode(twice)
 
 
 def test_a_wrong_png_checksum_is_refused() -> None:
     png = bytearray(encode(scene(), ".png"))
     png[len(png) // 2] ^= 1
     with pytest.raises(UndecodableImageError):
-        decode_photo(bytes(png), **LIMITS)
+        decode(bytes(png))
 
 
 def test_many_empty_segments_do_not_take_long() -> None:
@@ -260,6 +270,7 @@ def test_many_empty_segments_do_not_take_long() -> None:
 def test_exif_focal_length_holds_for_the_whole_sensor_only() -> None:
     stated = read_exif(tiff(1, focal_35mm=26, size=(4032, 3024)))
     focal = stated.focal_length_px(4032, 3024)
+    assert focal is not None
     assert focal == pytest.approx(26 * 5040 / 43.2666, rel=1e-4)
     assert stated.focal_length_px(1008, 756) == pytest.approx(focal / 4), "scaled"
     assert stated.focal_length_px(3024, 4032) == pytest.approx(focal), "turned"

@@ -1,0 +1,1 @@
+"""Measuring speed: of the whole service and of its stages."""

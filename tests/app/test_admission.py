@@ -1,0 +1,207 @@
+"""Admission on its own: permits, queue, deadline, clients that leave."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Coroutine
+from typing import Any
+
+import pytest
+
+from app.admission import Admission, Arrival, ClientGoneError
+from app.errors import OverloadedError
+from app.quota import Quota
+
+
+def run(scenario: Coroutine[Any, Any, None]) -> None:
+    asyncio.run(asyncio.wait_for(scenario, 20))
+
+
+def arrival(gone: asyncio.Future[None] | None = None) -> Arrival:
+    return Arrival(time.monotonic(), gone or asyncio.get_running_loop().create_future())
+
+
+def admission(workers: int = 1, queue_size: int = 4, deadline_s: float = 5.0) -> Admission:
+    return Admission(workers=workers, queue_size=queue_size, deadline_s=deadline_s)
+
+
+def test_never_more_threads_than_permits() -> None:
+    async def scenario() -> None:
+        gate = admission(workers=2, queue_size=20)
+        running, most = 0, 0
+        lock = threading.Lock()
+
+        def work() -> None:
+            nonlocal running, most
+            with lock:
+                running += 1
+                most = max(most, running)
+            time.sleep(0.01)
+            with lock:
+                running -= 1
+
+        await asyncio.gather(*(gate.run("x", work, arrival()) for _ in range(12)))
+        assert most == 2
+        await asyncio.sleep(0.05)
+        assert (gate.running, gate.waiting) == (0, 0)
+        gate.close()
+
+    run(scenario())
+
+
+def test_a_full_queue_refuses_within_ten_milliseconds() -> None:
+    async def scenario() -> None:
+        gate = admission(queue_size=1)
+        done = threading.Event()
+        tasks = [asyncio.create_task(gate.run("x", done.wait, arrival())) for _ in range(2)]
+        await asyncio.sleep(0.02)
+        started = time.perf_counter()
+        with pytest.raises(OverloadedError) as caught:
+            await gate.run("x", done.wait, arrival())
+        assert time.perf_counter() - started < 0.010
+        assert caught.value.reason == "queue_full"
+        assert int(caught.value.headers["Retry-After"]) >= 1
+        done.set()
+        await asyncio.gather(*tasks)
+        gate.close()
+
+    run(scenario())
+
+
+def test_a_wait_past_the_deadline_is_refused_at_once() -> None:
+    async def scenario() -> None:
+        gate = admission(deadline_s=0.2)
+        gate.expect("x", 0.15)
+        done = threading.Event()
+        first = asyncio.create_task(gate.run("x", done.wait, arrival()))
+        await asyncio.sleep(0.01)
+        started = time.perf_counter()
+        with pytest.raises(OverloadedError) as caught:
+            await gate.run("x", done.wait, arrival())
+        assert time.perf_counter() - started < 0.010
+        assert caught.value.reason == "deadline"
+        done.set()
+        await first
+        gate.close()
+
+    run(scenario())
+
+
+def test_a_turn_that_does_not_come_in_time_is_refused() -> None:
+    """The estimate was too hopeful: the work takes longer than it used to."""
+
+    async def scenario() -> None:
+        gate = admission(deadline_s=0.1)
+        gate.expect("x", 0.001)
+        done = threading.Event()
+        first = asyncio.create_task(gate.run("x", done.wait, arrival()))
+        await asyncio.sleep(0.01)
+        with pytest.raises(OverloadedError):
+            await gate.run("x", done.wait, arrival())
+        assert gate.waiting == 0
+        done.set()
+        await first
+        gate.close()
+
+    run(scenario())
+
+
+def test_with_a_worker_free_nothing_is_refused() -> None:
+    async def scenario() -> None:
+        gate = admission(deadline_s=0.001)
+        gate.expect("x", 10.0)
+        assert await gate.run("x", lambda: 7, arrival()) == 7
+        gate.close()
+
+    run(scenario())
+
+
+def test_work_of_clients_that_left_is_never_started() -> None:
+    async def scenario() -> None:
+        gate = admission()
+        done, ran = threading.Event(), threading.Event()
+        first = asyncio.create_task(gate.run("x", done.wait, arrival()))
+        gone: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        second = asyncio.create_task(gate.run("x", ran.set, arrival(gone)))
+        await asyncio.sleep(0.01)
+        gone.set_result(None)
+        with pytest.raises(ClientGoneError):
+            await second
+        done.set()
+        await first
+        with pytest.raises(ClientGoneError):
+            await gate.run("x", ran.set, arrival(gone))
+        assert not ran.is_set()
+        gate.close()
+
+    run(scenario())
+
+
+def test_a_cancelled_request_keeps_its_permit_until_the_thread_ends() -> None:
+    async def scenario() -> None:
+        gate = admission(queue_size=0)
+        done = threading.Event()
+        first = asyncio.create_task(gate.run("x", done.wait, arrival()))
+        await asyncio.sleep(0.01)
+        first.cancel()
+        await asyncio.sleep(0.01)
+        assert first.cancelled()
+        assert gate.running == 1
+        with pytest.raises(OverloadedError):
+            await gate.run("x", done.wait, arrival())
+        done.set()
+        await asyncio.sleep(0.05)
+        assert gate.running == 0
+        gate.close()
+
+    run(scenario())
+
+
+def test_a_cancelled_wait_leaves_the_queue() -> None:
+    async def scenario() -> None:
+        gate = admission()
+        done = threading.Event()
+        first = asyncio.create_task(gate.run("x", done.wait, arrival()))
+        second = asyncio.create_task(gate.run("x", done.wait, arrival()))
+        await asyncio.sleep(0.01)
+        second.cancel()
+        await asyncio.sleep(0.01)
+        assert gate.waiting == 0
+        done.set()
+        await first
+        await asyncio.sleep(0.05)
+        assert gate.running == 0
+        gate.close()
+
+    run(scenario())
+
+
+def test_errors_of_the_work_come_back_and_free_the_permit() -> None:
+    async def scenario() -> None:
+        gate = admission()
+
+        def fail() -> None:
+            raise ZeroDivisionError
+
+        with pytest.raises(ZeroDivisionError):
+            await gate.run("x", fail, arrival())
+        await asyncio.sleep(0.02)
+        assert gate.running == 0
+        gate.close()
+
+    run(scenario())
+
+
+def test_quota_refills_steadily() -> None:
+    now = 0.0
+    quota = Quota(["a", "b"], per_minute=2, clock=lambda: now)
+    assert [quota.take("a") for _ in range(3)] == [None, None, 30]
+    assert quota.take("b") is None
+    now = 29.0
+    assert quota.take("a") == 1
+    now = 30.5
+    assert quota.take("a") is None
+    now = 1e6
+    assert [quota.take("a") for _ in range(3)] == [None, None, 30], "no more than a minute's worth"

@@ -1,0 +1,172 @@
+"""POST /v1/lift: 2D in, 3D out, over a real socket."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from app.schemas import LiftAnswer
+from library_store.skeleton import L_ANKLE, LSP14, R_ANKLE
+from tests.app.conftest import Render
+from tests.app.server import Server
+from tests.app.test_errors_over_http import problem
+from tests.app.test_poses_over_http import boxed, joints_mm, joints_px, project
+
+
+def person_of(render: Render, leave_out: tuple[int, ...] = ()) -> dict[str, Any]:
+    return {
+        "joints_2d": [
+            {"name": name, "x_px": x, "y_px": y}
+            for joint, (name, (x, y)) in enumerate(
+                zip(LSP14.joint_names, render.joints_px.tolist(), strict=True)
+            )
+            if joint not in leave_out
+        ]
+    }
+
+
+def request_of(render: Render, **fields: Any) -> dict[str, Any]:
+    return {
+        "image": {"width_px": render.width_px, "height_px": render.height_px},
+        "focal_length_px": render.focal_length_px,
+        "people": [person_of(render)],
+        **fields,
+    }
+
+
+def lift(server: Server, body: dict[str, Any]) -> list[dict[str, Any]]:
+    response = server.client.post("/v1/lift", json=body)
+    assert response.status_code == 200, response.text
+    LiftAnswer.model_validate_json(response.content)
+    people: list[dict[str, Any]] = response.json()["people"]
+    return people
+
+
+def root_relative_error_mm(person: dict[str, Any], render: Render) -> float:
+    hips = [LSP14.index("r_hip"), LSP14.index("l_hip")]
+    found, truth = joints_mm(person), render.joints_mm
+    found = found - found[hips].mean(axis=0)
+    truth = truth - truth[hips].mean(axis=0)
+    return float(np.linalg.norm(found - truth, axis=1).mean())
+
+
+def test_true_joints_give_nearly_the_true_pose(server: Server, renders: list[Render]) -> None:
+    errors = []
+    for render in renders:
+        (person,) = lift(server, request_of(render))
+        assert person["camera"]["focal_source"] == "request"
+        np.testing.assert_allclose(joints_px(person), render.joints_px, atol=0.001)
+        errors.append(root_relative_error_mm(person, render))
+        seen = project(joints_mm(person), person["camera"])
+        assert np.linalg.norm(seen - render.joints_px, axis=1).mean() < 10
+    assert np.mean(errors) < 120, errors
+
+
+def test_what_was_found_in_a_photo_lifts_to_the_same(server: Server, renders: list[Render]) -> None:
+    """The paper's method takes nothing from the photo but the joints."""
+    (seen,) = boxed(server, renders[0], "method=paper&candidates=0")["people"]
+    if any(joint["confidence"] is None for joint in seen["joints_2d"]):
+        pytest.fail("the shipped network's confidence is calibrated")
+    body = request_of(renders[0], method="paper", candidates=0, focal_length_px=None)
+    body["people"] = [
+        {
+            "joints_2d": [
+                {key: joint[key] for key in ("name", "x_px", "y_px", "confidence")}
+                for joint in seen["joints_2d"]
+            ]
+        }
+    ]
+    (lifted,) = lift(server, body)
+    np.testing.assert_allclose(joints_mm(lifted), joints_mm(seen), atol=60)
+
+
+def test_people_do_not_influence_each_other(server: Server, renders: list[Render]) -> None:
+    together = lift(server, request_of(renders[0], people=[person_of(r) for r in renders]))
+    alone = [lift(server, request_of(renders[0], people=[person_of(r)]))[0] for r in renders]
+    assert together == alone
+
+
+def test_missing_joints(server: Server, renders: list[Render]) -> None:
+    missing = (R_ANKLE, L_ANKLE)
+    left_out = person_of(renders[0], leave_out=missing)
+    unsure = person_of(renders[0])
+    for joint in missing:
+        unsure["joints_2d"][joint] |= {"confidence": 0, "x_px": -5e5, "y_px": 9e5}
+    a, b = lift(server, request_of(renders[0], people=[left_out, unsure]))
+    assert a == b
+    assert len(a["joints_2d"]) == 12, "what was not given is not made up"
+    assert len(a["joints_3d"]) == 14
+    assert "truncated" in a["warnings"]
+
+
+def test_too_few_joints_are_not_lifted(server: Server, renders: list[Render]) -> None:
+    people = [
+        person_of(renders[0], leave_out=tuple(range(4, 14))),
+        {"joints_2d": []},
+        person_of(renders[0]),
+    ]
+    few, none, whole = lift(server, request_of(renders[0], people=people))
+    for person in (few, none):
+        assert person["joints_3d"] is None
+        assert person["exemplar"] is None
+        assert person["camera"] is None
+        assert person["candidates"] == []
+        assert person["warnings"]
+    assert len(few["joints_2d"]) == 4
+    assert whole["joints_3d"] is not None
+
+
+def test_defaults_are_those_of_photos(server: Server, renders: list[Render]) -> None:
+    (person,) = lift(server, request_of(renders[0], focal_length_px=None))
+    assert person["camera"]["focal_source"] == "assumed"
+    assert person["camera"]["focal_length_px"] == pytest.approx(614.7, abs=0.1)
+    assert person["camera"]["principal_point_px"] == [319.5, 239.5]
+
+
+def test_nobody_and_many(server: Server, renders: list[Render]) -> None:
+    assert lift(server, request_of(renders[0], people=[])) == []
+    crowd = [person_of(renders[0])] * 256
+    assert len(lift(server, request_of(renders[0], people=crowd, candidates=0))) == 256
+    too_many = request_of(renders[0], people=[*crowd, crowd[0]])
+    body = problem(server.client.post("/v1/lift", json=too_many), 422, "invalid-input")
+    assert body["errors"][0]["where"] == "people"
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        ({"skeleton": "coco17"}, "skeleton"),
+        ({"focal_length_px": -1}, "focal_length_px"),
+        ({"image": {"width_px": 0, "height_px": 5}}, "image.width_px"),
+        ({"colour": "red"}, "colour"),
+        ({"people": [{"joints_2d": [{"name": "nose", "x_px": 1, "y_px": 2}]}]}, "people.0"),
+        (
+            {"people": [{"joints_2d": [{"name": "neck", "x_px": 1, "y_px": 2}] * 2}]},
+            "people.0",
+        ),
+        (
+            {"people": [{"joints_2d": [{"name": "neck", "x_px": 1e9, "y_px": 2}]}]},
+            "people.0.joints_2d.0.x_px",
+        ),
+        ({"people": [{"joints_2d": [{"name": "neck", "x_px": 1}]}]}, "people.0.joints_2d.0.y_px"),
+    ],
+)
+def test_bad_values_are_named(
+    server: Server, renders: list[Render], change: dict[str, Any], where: str
+) -> None:
+    response = server.client.post("/v1/lift", json=request_of(renders[0]) | change)
+    assert problem(response, 422, "invalid-input")["errors"][0]["where"] == where
+
+
+@pytest.mark.parametrize("body", [b"{", b"\xff\xfe", b"[" * 100_000])
+def test_no_json(server: Server, body: bytes) -> None:
+    problem(server.client.post("/v1/lift", content=body), 400, "malformed-body")
+
+
+def test_nan_is_no_coordinate(server: Server) -> None:
+    text = '{"image":{"width_px":9,"height_px":9},"people":[{"joints_2d":'
+    text += '[{"name":"neck","x_px":NaN,"y_px":1}]}]}'
+    response = server.client.post("/v1/lift", content=text.encode())
+    assert response.status_code in {400, 422}

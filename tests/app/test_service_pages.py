@@ -1,0 +1,125 @@
+"""Health, info, metrics, headers, OpenAPI and the page."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from typing import Any
+
+from app.schemas import InfoAnswer, LiftAnswer, LiftRequest, PosesAnswer
+from tests.app.server import Server
+
+
+def test_health(server: Server) -> None:
+    assert server.client.get("/livez").json() == {"status": "ok"}
+    assert server.client.get("/readyz").json() == {"status": "ok"}
+
+
+def test_info(server: Server) -> None:
+    response = server.client.get("/v1/info")
+    info = InfoAnswer.model_validate_json(response.content)
+    assert info.library.name == "small"
+    assert info.library.exemplars == 4000
+    assert len(info.model.sha256) == 64
+    assert info.limits.max_body_bytes == 2_000_000
+    assert info.licences
+
+
+def test_request_ids_are_taken_or_made(server: Server) -> None:
+    def answered(given: str) -> str:
+        response = server.client.get("/livez", headers={"X-Request-ID": given})
+        return response.headers["x-request-id"]
+
+    assert answered("client-id.42:a") == "client-id.42:a"
+    made = server.client.get("/livez").headers["x-request-id"]
+    assert re.fullmatch(r"[0-9a-f]{32}", made)
+    for bad in ("x" * 65, "a b", "<script>", ""):
+        assert re.fullmatch(r"[0-9a-f]{32}", answered(bad))
+
+
+def test_server_timing_has_the_stages(server: Server, photo: bytes) -> None:
+    response = server.client.post("/v1/poses", content=photo)
+    timing = response.headers["server-timing"]
+    stages = dict(re.findall(r"(\w+);dur=([\d.]+)", timing))
+    assert {"decode", "detect", "pose", "total", "app"} <= stages.keys()
+    total = response.json()["timings_ms"]["total"]
+    assert float(stages["total"]) == total
+    assert float(stages["app"]) >= total
+
+
+def test_metrics(server: Server, photo: bytes) -> None:
+    sample = 'posematch_requests_total{method="POST",route="/v1/poses",status="200"}'
+    before = server.metric(sample)
+    server.client.post("/v1/poses", content=photo)
+    server.client.get("/some/unknown/path")
+    assert server.metric(sample) == before + 1
+    assert server.metric('posematch_stage_seconds_count{stage="decode"}') >= 1
+    assert server.metric("posematch_people_per_image_count") >= 1
+    text = server.client.get("/metrics").text
+    assert "some/unknown" not in text, "clients cannot make labels"
+    assert 'library="small 1"' in text
+
+
+def test_log_lines_are_json_with_the_request_id(server: Server) -> None:
+    server.client.get("/livez", headers={"X-Request-ID": "find-me-in-the-log"})
+    deadline = time.monotonic() + 5  # the line is written after the answer
+    while not (found := [s for s in server.log.read_text().splitlines() if "find-me" in s]):
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    (line,) = map(json.loads, found)
+    assert (line["method"], line["path"], line["status"]) == ("GET", "/livez", 200)
+
+
+def test_openapi_is_whole_and_its_examples_hold(server: Server) -> None:
+    document: dict[str, Any] = server.client.get("/openapi.json").json()
+    text = json.dumps(document)
+    defined = set(document["components"]["schemas"])
+    assert set(re.findall(r'"#/components/schemas/(\w+)"', text)) <= defined
+    assert "HTTPValidationError" not in text, "every error is a problem"
+    paths = document["paths"]
+    assert set(paths) == {
+        "/v1/poses",
+        "/v1/poses/batch",
+        "/v1/lift",
+        "/v1/exemplars/{exemplar_id}",
+        "/v1/info",
+        "/livez",
+        "/readyz",
+        "/metrics",
+    }
+    poses = paths["/v1/poses"]["post"]
+    assert set(poses["requestBody"]["content"]) == {
+        "image/jpeg",
+        "image/png",
+        "image/webp",
+        "multipart/form-data",
+    }
+    assert {"200", "400", "401", "408", "413", "415", "422", "429", "503"} == set(
+        poses["responses"]
+    )
+    names = {parameter["name"] for parameter in poses["parameters"]}
+    assert names == {
+        "max_people",
+        "candidates",
+        "method",
+        "box_px",
+        "focal_length_px",
+        "fov_deg",
+        "subject_height_mm",
+        "mirrored",
+    }
+    answer = poses["responses"]["200"]["content"]["application/json"]["example"]
+    assert PosesAnswer.model_validate(answer).people
+    lift = paths["/v1/lift"]["post"]
+    asked = lift["requestBody"]["content"]["application/json"]["example"]
+    assert LiftRequest.model_validate(asked).people
+    assert server.client.post("/v1/lift", json=asked).status_code == 200
+    lifted = lift["responses"]["200"]["content"]["application/json"]["example"]
+    assert LiftAnswer.model_validate(lifted).people
+
+
+def test_the_page_asks_nobody_else(server: Server) -> None:
+    page = server.client.get("/")
+    assert page.headers["content-type"].startswith("text/html")
+    assert not re.findall(r"(?:src|href|url\()\s*=?\s*[\"']?(?:https?:)?//", page.text)

@@ -1,0 +1,114 @@
+"""Starting and stopping the real process: what refuses to start says why, without a traceback."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import subprocess
+import threading
+import time
+from pathlib import Path
+
+import cv2
+import httpx
+import numpy as np
+import pytest
+
+from app.main import create_app
+from app.settings import Settings
+from models.card import WEIGHTS_DIR
+from tests.app.server import COMMAND, Server, environment
+
+
+def refusal(tmp_path: Path, **settings: object) -> str:
+    """What `posematch serve` says on stderr when it refuses to start."""
+    outcome = subprocess.run(
+        [COMMAND, "serve", "--port", "0"],
+        env=environment(**{"cache_dir": tmp_path / "cache", **settings}),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert outcome.returncode == 1, outcome.stderr
+    assert "Traceback" not in outcome.stderr
+    assert "cannot start" in outcome.stderr
+    return outcome.stderr
+
+
+def test_bad_settings(tmp_path: Path) -> None:
+    assert "POSEMATCH_WORKERS" in refusal(tmp_path, workers=0)
+    assert "POSEMATCH_WORKERS" in refusal(tmp_path, worker=1), "a hint at the right name"
+
+
+def test_missing_library(tmp_path: Path) -> None:
+    said = refusal(tmp_path, library_dir=tmp_path / "none")
+    assert str(tmp_path / "none") in said
+    assert "posematch library build" in said
+
+
+def test_corrupt_library(tmp_path: Path, library_dir: Path) -> None:
+    broken = tmp_path / "broken"
+    shutil.copytree(library_dir, broken)
+    with (broken / "poses.npy").open("r+b") as file:
+        file.seek(5000)
+        file.write(b"oops")
+    assert str(broken / "poses.npy") in refusal(tmp_path, library_dir=broken)
+
+
+def test_missing_and_corrupt_model(tmp_path: Path, library_dir: Path) -> None:
+    said = refusal(tmp_path, library_dir=library_dir, weights_dir=tmp_path / "none")
+    assert str(tmp_path / "none") in said
+    broken = tmp_path / "weights"
+    shutil.copytree(WEIGHTS_DIR, broken)
+    (broken / "cpm.onnx").write_bytes(b"\x00" * 1000)
+    assert "cpm.onnx" in refusal(tmp_path, library_dir=library_dir, weights_dir=broken)
+
+
+def test_unwritable_cache(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_text("not a directory")
+    assert str(file) in refusal(tmp_path, cache_dir=file / "cache")
+
+
+def test_not_ready_before_the_engine_is_loaded_nor_while_stopping() -> None:
+    """Without its lifespan the application has no engine yet."""
+    app = create_app(Settings())
+
+    async def scenario() -> None:
+        transport = httpx.ASGITransport(app=app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://test") as client:
+            for stopping in (False, True):
+                app.state.service.stopping = stopping
+                assert (await client.get("/livez")).status_code == 200
+                assert (await client.get("/metrics")).status_code == 200
+                for path in ("/readyz", "/v1/info"):
+                    response = await client.get(path)
+                    assert response.status_code == 503
+                    assert response.json()["type"] == "urn:posematch:problem:not-ready"
+                    assert response.headers["retry-after"] == "1"
+                response = await client.post("/v1/poses", content=b"x")
+                assert response.status_code == 503
+
+    asyncio.run(scenario())
+
+
+def test_requests_under_way_finish_at_sigterm(tmp_path: Path, library_dir: Path) -> None:
+    heavy = cv2.imencode(".png", np.zeros((5000, 5000, 3), np.uint8))[1].tobytes()
+    server = Server(tmp_path / "log", library_dir=library_dir, deadline_ms=60_000)
+    answers: list[httpx.Response] = []
+
+    def post() -> None:
+        answers.append(httpx.post(server.url + "/v1/poses", content=heavy, timeout=60))
+
+    with server:
+        thread = threading.Thread(target=post)
+        thread.start()
+        while not answers and server.metric("posematch_running") == 0:
+            time.sleep(0.001)
+        server.stop()
+        thread.join()
+    assert [answer.status_code for answer in answers] == [200]
+    assert "Traceback" not in server.log.read_text()
+    with pytest.raises(httpx.ConnectError):
+        httpx.get(server.url + "/livez")
