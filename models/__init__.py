@@ -1,1 +1,20 @@
-"""p(x | I): from an image crop to 2D joints with a Convolutional Pose Machine."""
+"""p(x | I): from a photo to people's boxes and 2D joints.
+
+Two networks run by onnxruntime, each with a JSON model card beside its weights: a person detector
+on the whole photo and a Convolutional Pose Machine on each person's crop.
+"""
+
+from models.card import ModelCard
+from models.errors import ModelError
+from models.heatmaps import Joints2D
+from models.person_detector import PersonBox, PersonDetector
+from models.pose_estimator import PoseEstimator
+
+__all__ = [
+    "Joints2D",
+    "ModelCard",
+    "ModelError",
+    "PersonBox",
+    "PersonDetector",
+    "PoseEstimator",
+]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from library_store.skeleton import LSP14
-from models.training.dataset import LabelledCrop
+from models.training.dataset import Image, LabelledCrop
 
 MIRROR = np.array(LSP14.mirror)
 CROP_SCALE = 1.25
@@ -25,7 +25,7 @@ class Sample:
     outside the crop, -1 unknown.
     """
 
-    image: NDArray[np.uint8]
+    image: Image
     joints_px: NDArray[np.float32]
     weight: NDArray[np.float32]
     presence: NDArray[np.float32]
@@ -111,14 +111,14 @@ def random_view(
     if rng.random() < 0.35:
         for _ in range(rng.integers(1, 3)):
             _occlude(image, sample.joints_px, presence, other.image, rng)
-    return Sample(_expose(image, rng), sample.joints_px, sample.weight, presence)
+    return Sample(expose(image, rng), sample.joints_px, sample.weight, presence)
 
 
 def _occlude(
-    image: NDArray[np.uint8],
+    image: Image,
     joints_px: NDArray[np.float32],
     presence: NDArray[np.float32],
-    other: NDArray[np.uint8],
+    other: Image,
     rng: np.random.Generator,
 ) -> None:
     """Paste a patch of another photo (often somebody's limbs), in place."""
@@ -140,7 +140,7 @@ def _occlude(
     presence[under & (presence > 0)] = -1  # still inferable, but not to be called seen
 
 
-def _expose(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+def expose(image: Image, rng: np.random.Generator) -> Image:
     """Exposure, white balance, grey, blur, low resolution, noise and JPEG."""
     ramp = np.linspace(0, 1, 256, dtype=np.float32)
     gamma = np.exp(rng.normal(0, 0.25))
@@ -154,10 +154,10 @@ def _expose(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.ui
     if dice[1] < 0.1:
         image = cv2.GaussianBlur(image, (0, 0), rng.uniform(0.5, 2.0))
     if dice[2] < 0.1:
-        small = max(24, int(image.shape[0] * rng.uniform(0.25, 0.6)))
+        less = rng.uniform(0.25, 0.6)
         image = cv2.resize(
-            cv2.resize(image, (small, small), interpolation=cv2.INTER_AREA),
-            image.shape[:2],
+            cv2.resize(image, None, fx=less, fy=less, interpolation=cv2.INTER_AREA),
+            image.shape[1::-1],
             interpolation=cv2.INTER_LINEAR,
         )
     if dice[3] < 0.07:
@@ -165,5 +165,6 @@ def _expose(image: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.ui
         image = np.clip(image + noise, 0, 255).astype(np.uint8)
     if dice[4] < 0.07:
         _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 75))])
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        return image if decoded is None else decoded
     return image

@@ -23,6 +23,9 @@ from library_store.skeleton import HEAD_TOP, LSP14, NECK
 MP33_LIMBS = (12, 14, 16, 11, 13, 15, 24, 26, 28, 23, 25, 27)
 """The teacher's landmarks for joints 2..13 of lsp14, in that order."""
 
+Image = NDArray[Any]
+"""(h, w, 3) uint8 BGR; OpenCV's type stubs promise less."""
+
 HOLD_OUT_ONE_IN = 7
 
 
@@ -37,7 +40,7 @@ class LabelledCrop:
 
     name: str
     group: int
-    image: NDArray[np.uint8]
+    image: Image
     joints_px: NDArray[np.float32]
     weight: NDArray[np.float32]
     visible: NDArray[np.float32]
@@ -63,9 +66,19 @@ def _members(path: Path) -> Iterator[tuple[str, bytes]]:
                 yield Path(member.name).name, stream.read()
 
 
-def _from_labels(
-    record: dict[str, Any], image: NDArray[np.uint8], group: int
-) -> LabelledCrop | None:
+def _decode(data: bytes) -> Image:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise ValueError("a JPEG of the data set cannot be decoded")
+    return image
+
+
+def decode_members(path: Path) -> dict[str, Image]:
+    """Every JPEG of a folder or tar, by name, (h, w, 3) uint8 BGR."""
+    return {name: _decode(data) for name, data in _members(path) if name.endswith(".jpg")}
+
+
+def _from_labels(record: dict[str, Any], image: Image, group: int) -> LabelledCrop | None:
     labelled = np.asarray(record["labelled"], np.float32)
     if labelled.sum() < 6:
         return None
@@ -80,7 +93,7 @@ def _from_labels(
     )
 
 
-def _from_teachers(record: dict[str, Any], image: NDArray[np.uint8]) -> LabelledCrop | None:
+def _from_teachers(record: dict[str, Any], image: Image) -> LabelledCrop | None:
     landmarks = np.asarray(record["mp33_px"], np.float32)
     visibility = np.asarray(record["mp_visibility"], np.float32)[list(MP33_LIMBS)]
     agreement = np.array([9.0 if v is None else v for v in record["agreement"]], np.float32)
@@ -125,15 +138,14 @@ def load(path: Path) -> list[LabelledCrop]:
         raise FileNotFoundError(f"{path} has no annotations.json")
     crops: list[LabelledCrop] = []
     for i, record in enumerate(annotations["images"]):
-        image = cv2.imdecode(np.frombuffer(images[record["image"]], np.uint8), cv2.IMREAD_COLOR)
-        crop = (
-            _from_labels(record, image, i) if "labelled" in record else _from_teachers(record, image)
-        )
+        image = _decode(images[record["image"]])
+        by_hand = "labelled" in record
+        crop = _from_labels(record, image, i) if by_hand else _from_teachers(record, image)
         if crop is not None:
             crops.append(crop)
     return crops
 
 
 def held_out(crop: LabelledCrop) -> bool:
-    """Whether the photo a crop was cut from belongs to the held-out part (whole photos at a time)."""
+    """Whether the photo that a crop was cut from is held out (whole photos at a time)."""
     return (crop.group * 2654435761 % 2**32) % HOLD_OUT_ONE_IN == 0

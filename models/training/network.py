@@ -159,3 +159,53 @@ class ConvolutionalPoseMachine(nn.Module):
         x = self.fine(F.relu(x4 + _up2(self.fine_low(hidden))))
         every.append(up + self.fine_score(x))
         return every
+
+
+@dataclass(frozen=True)
+class PersonConfig:
+    """Sizes of the person network."""
+
+    width: int = 32
+    blocks: tuple[int, int, int] = (2, 3, 3)
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain values, for JSON."""
+        return asdict(self)
+
+
+class PersonNetwork(nn.Module):
+    """Whole image -> where people's centres are, and their boxes, at stride 8.
+
+    A centre map and four distances a cell (to the box's left, top, right and bottom), as in
+    CenterNet and FCOS, on a residual pyramid down to stride 32.
+    """
+
+    STRIDE = 8
+
+    def __init__(self, cfg: PersonConfig) -> None:
+        super().__init__()
+        self.cfg = cfg
+        w = cfg.width
+        n8, n16, n32 = cfg.blocks
+        self.stem = nn.Sequential(nn.PixelUnshuffle(4), _conv_bn(48, w, 3, 2), nn.ReLU())
+        self.c8 = _chain(w, w, n8, 1)
+        self.c16 = _chain(w, 2 * w, n16, 2)
+        self.c32 = _chain(2 * w, 3 * w, n32, 2)
+        self.t32 = _conv_bn(3 * w, 2 * w, 1)
+        self.m16 = Residual(2 * w, 2 * w)
+        self.t16 = _conv_bn(2 * w, w, 1)
+        self.m8 = Residual(w, w)
+        self.score = nn.Conv2d(w, 5, 1)
+        nn.init.normal_(self.score.weight, std=0.01)
+        nn.init.constant_(self.score.bias, 0.0)
+        with torch.no_grad():
+            assert self.score.bias is not None
+            self.score.bias[0] = -4.0
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(B, 3, H, W) in [-1, 1] -> (B, 5, H/8, W/8): centre logit, log distances in 32 px."""
+        x8 = self.c8(self.stem(image))
+        x16 = self.c16(x8)
+        y16 = self.m16(F.relu(x16 + _up2(self.t32(self.c32(x16)))))
+        out: Tensor = self.score(self.m8(F.relu(x8 + _up2(self.t16(y16)))))
+        return out

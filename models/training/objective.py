@@ -7,6 +7,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 PRESENCE_WEIGHT = 0.1
+COARSE_SIGMA_CELLS, FINE_SIGMA_CELLS = 0.8, 1.2
+"""Blur of the targets at stride 8 and at stride 4, in cells."""
 
 
 def gaussian_targets(joints_px: Tensor, cells: int, stride: float, sigma_cells: float) -> Tensor:
@@ -53,10 +55,8 @@ def total_loss(
 ) -> Tensor:
     """Mean over the stages (intermediate supervision), the last, finer one counting double."""
     terms = [
-        stage_loss(
-            logits, joints_px, weight, presence, size, 1.2 if i == len(stages) - 1 else 0.8
-        )
-        for i, logits in enumerate(stages)
+        stage_loss(logits, joints_px, weight, presence, size, COARSE_SIGMA_CELLS)
+        for logits in stages[:-1]
     ]
-    terms.append(terms[-1])
+    terms += [stage_loss(stages[-1], joints_px, weight, presence, size, FINE_SIGMA_CELLS)] * 2
     return torch.stack(terms).mean()

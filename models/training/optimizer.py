@@ -1,7 +1,7 @@
 """Muon for convolution kernels, AdamW for the rest.
 
 Muon (Jordan et al. 2024) replaces the momentum matrix by its nearest semi-orthogonal one, found
-with a Newton-Schulz iteration; here a kernel (c_out, c_in, k, k) counts as a matrix (c_out, c_in k k).
+with a Newton-Schulz iteration; a kernel (c_out, c_in, k, k) counts as a (c_out, c_in k k) matrix.
 It needs far fewer crops than AdamW for the same accuracy, and crops are what CPU training lacks.
 """
 
@@ -64,7 +64,8 @@ class Muon(torch.optim.Optimizer):
 
 def build(model: nn.Module, kind: str, lr: float) -> list[torch.optim.Optimizer]:
     """``muon`` or ``adamw``; ``lr`` is AdamW's rate, Muon's is ten times that."""
-    kernels, rest = [], []
+    kernels: list[Tensor] = []
+    rest: list[Tensor] = []
     for name, p in model.named_parameters():
         is_kernel = kind == "muon" and p.ndim == 4 and "score" not in name
         (kernels if is_kernel else rest).append(p)

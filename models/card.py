@@ -1,0 +1,106 @@
+"""Model cards: what a weights file is, what it takes, what it was trained on and how good it is."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from models.errors import ModelError
+
+WEIGHTS_DIR = Path(__file__).parent / "weights"
+"""The weights that ship with the project."""
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class ConfidenceCalibration(_Frozen):
+    """Logistic model of P(joint within 0.2 torso lengths); see heatmaps.confidence_features."""
+
+    coefficients: list[list[float]] = Field(description="per joint: intercept, then per feature")
+    fitted_on: str
+    expected_calibration_error: float
+
+
+class SpreadCalibration(_Frozen):
+    """68% error radius = factor x spread (heat map) per joint, in the crop's pixels."""
+
+    factor: list[float]
+    fitted_on: str
+    coverage: float = Field(description="share of held-out errors within the radius")
+
+
+class PoseOutput(_Frozen):
+    """How a pose network is fed and read."""
+
+    kind: Literal["pose"]
+    joint_names: list[str]
+    input_px: int = Field(description="side of the square crop the network sees")
+    crop_scale: float = Field(description="crop's side over the joints' box's longer side")
+    stride_px: float = Field(description="input pixels per heat map cell")
+    target_sigma_cells: float = Field(description="blur of the training targets")
+    maps: Literal["logits", "beliefs"]
+    confidence: ConfidenceCalibration | None = None
+    spread: SpreadCalibration | None = None
+
+
+class DetectorOutput(_Frozen):
+    """How a person network is fed and read."""
+
+    kind: Literal["people"]
+    long_side_px: int = Field(description="the photo is shrunk until its longer side is this")
+    stride_px: int
+    unit_px: float = Field(description="distances are logarithms of multiples of this")
+    threshold: float = Field(description="least score of a person")
+
+
+class ModelCard(_Frozen):
+    """The JSON beside a weights file."""
+
+    name: str
+    version: str
+    file: str
+    sha256: str
+    description: str
+    parameters: int
+    multiply_adds: int = Field(description="per input image or crop of the default size")
+    output: Annotated[PoseOutput | DetectorOutput, Field(discriminator="kind")]
+    training_data: list[str]
+    licence: str
+    limits: list[str]
+    measured: dict[str, float | str]
+
+
+def read_card(path: Path) -> ModelCard:
+    """Read and check a card; ``ModelError`` names the file and what is wrong with it."""
+    try:
+        return ModelCard.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        raise ModelError(
+            f"model card {path} is missing; restore it from the repository "
+            "or point POSEMATCH_WEIGHTS_DIR at a folder that has it"
+        ) from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "the file"
+        raise ModelError(f"model card {path} is not valid at {where}: {first['msg']}") from None
+
+
+def read_weights(path: Path, card: ModelCard) -> bytes:
+    """The weights' bytes, checked against the card's sha256; ``ModelError`` when they differ."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise ModelError(
+            f"model weights {path} are missing; restore the file from the repository"
+        ) from None
+    if hashlib.sha256(data).hexdigest() != card.sha256:
+        raise ModelError(
+            f"model weights {path} do not match their card (sha256 differs): the file is corrupt "
+            "or belongs to another version; restore both from the repository"
+        )
+    return data

@@ -1,0 +1,51 @@
+"""Cutting a square out of a photo and scaling it to the network's input, without aliasing."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+
+def square_crop(
+    image: NDArray[np.uint8], center_px: tuple[float, float], side_px: float, size: int
+) -> tuple[NDArray[np.uint8], float, tuple[float, float]]:
+    """Square of ``side_px`` around ``center_px`` as (size, size, 3); black beyond the photo.
+
+    Returns the crop, its pixels' size in the photo's pixels (``scale``) and the photo position of
+    its pixel (0, 0) (``origin``): photo = origin + scale * crop, integers being pixel centres.
+    """
+    scale = side_px / size
+    origin = (
+        center_px[0] - (size - 1) / 2 * scale,
+        center_px[1] - (size - 1) / 2 * scale,
+    )
+    height, width = image.shape[:2]
+    source, shrink, left, top = image, 1, 0, 0
+    if scale >= 2:
+        # A plain warp would skip pixels: average whole blocks first, over the square alone.
+        shrink = int(scale)
+        left = max(0, int(origin[0] - scale))
+        top = max(0, int(origin[1] - scale))
+        right = min(width, int(origin[0] + side_px + scale) + 1)
+        bottom = min(height, int(origin[1] + side_px + scale) + 1)
+        columns, rows = (right - left) // shrink, (bottom - top) // shrink
+        if columns >= 1 and rows >= 1:
+            window = image[top : top + rows * shrink, left : left + columns * shrink]
+            source = np.asarray(
+                cv2.resize(window, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8
+            )
+        else:
+            shrink, left, top = 1, 0, 0
+    # Block b averages photo pixels whose centre is left + (b + 0.5) * shrink - 0.5.
+    step = scale / shrink
+    matrix = np.array(
+        [
+            [step, 0, (origin[0] - left + 0.5) / shrink - 0.5],
+            [0, step, (origin[1] - top + 0.5) / shrink - 0.5],
+        ]
+    )
+    crop = cv2.warpAffine(
+        source, matrix, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    )
+    return np.asarray(crop, np.uint8), scale, origin

@@ -1,0 +1,5 @@
+"""What can go wrong with a model file."""
+
+
+class ModelError(Exception):
+    """A model or its card is missing, corrupt or of the wrong kind; names the file and the mend."""

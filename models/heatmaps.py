@@ -1,0 +1,164 @@
+"""Heat maps -> marginals (eq. 3) -> joints: sub-pixel peak, spread and confidence, vectorised.
+
+Positions are pixels with integers at pixel centres. All functions take maps (N, J, h, w) and know
+nothing of the network that made them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Joints2D:
+    """One person's joints in the photo.
+
+    ``positions_px`` (J, 2); ``covariance_px2`` (J, 2, 2), the spread of each joint's marginal about
+    its position; ``confidence`` (J,), calibrated probability that the joint lies within 0.2 torso
+    lengths, or None while the model has no calibration; ``sigma_px`` (J,), the radius that holds
+    68% of errors, or None likewise; ``peak`` (J,), the raw belief at the position, in [0, 1].
+    """
+
+    positions_px: Floats
+    covariance_px2: Floats
+    confidence: Floats | None
+    sigma_px: Floats | None
+    peak: Floats
+
+
+def marginals(maps: NDArray[np.float32], kind: str) -> Floats:
+    """Each joint's distribution over the cells (eq. 3), (N, J, h, w), summing to 1.
+
+    ``logits`` are normalised by a softmax (odds of the beliefs), ``beliefs`` by their sum.
+    """
+    flat = maps.reshape(*maps.shape[:2], -1).astype(np.float64)
+    if kind == "logits":
+        flat = np.exp(flat - flat.max(-1, keepdims=True))
+    else:
+        flat = np.maximum(flat, 1e-12)
+    p: Floats = (flat / flat.sum(-1, keepdims=True)).reshape(maps.shape)
+    return p
+
+
+def sub_cell_peaks(p: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Peak of each map as (x, y) in cells, (N, J, 2), and its cell's flat index (N, J).
+
+    One Newton step on log p from the strongest cell, exact for a Gaussian (Zhang et al. 2020).
+    """
+    n, j, h, w = p.shape
+    best = p.reshape(n, j, -1).argmax(-1)
+    y, x = np.divmod(best, w)
+    # The 3x3 neighbourhood must exist: at the border the peak stays on its cell in that axis.
+    cy, cx = np.clip(y, 1, h - 2), np.clip(x, 1, w - 2)
+    ni, ji = np.ogrid[:n, :j]
+    steps = np.arange(-1, 2)
+    patch = p[
+        ni[..., None, None],
+        ji[..., None, None],
+        cy[..., None, None] + steps[:, None],
+        cx[..., None, None] + steps,
+    ]
+    log_p = np.log(np.maximum(patch, 1e-30))
+    gx = (log_p[..., 1, 2] - log_p[..., 1, 0]) / 2
+    gy = (log_p[..., 2, 1] - log_p[..., 0, 1]) / 2
+    xx = log_p[..., 1, 2] - 2 * log_p[..., 1, 1] + log_p[..., 1, 0]
+    yy = log_p[..., 2, 1] - 2 * log_p[..., 1, 1] + log_p[..., 0, 1]
+    xy = (log_p[..., 2, 2] - log_p[..., 2, 0] - log_p[..., 0, 2] + log_p[..., 0, 0]) / 4
+    det = xx * yy - xy * xy
+    sound = (xx < 0) & (yy < 0) & (det > 1e-9)
+    det = np.where(sound, det, 1.0)
+    dx = np.where(sound, (xy * gy - yy * gx) / det, 0.0)
+    dy = np.where(sound, (xy * gx - xx * gy) / det, 0.0)
+    dx = np.where(cx == x, np.clip(dx, -0.75, 0.75), 0.0)
+    dy = np.where(cy == y, np.clip(dy, -0.75, 0.75), 0.0)
+    return np.stack([x + dx, y + dy], -1), best
+
+
+def spread(p: Floats, at: Floats, target_sigma_cells: float) -> Floats:
+    """Second moment of each marginal about ``at`` (N, J, 2) in cells², (N, J, 2, 2).
+
+    The networks learn labels blurred by a Gaussian, so its variance is taken off again; a floor of
+    a tenth of a cell keeps the matrix invertible.
+    """
+    _, _, h, w = p.shape
+    dx = np.arange(w) - at[..., :1]
+    dy = np.arange(h) - at[..., 1:]
+    along_x, along_y = p.sum(-2), p.sum(-1)
+    xx = (along_x * dx**2).sum(-1)
+    yy = (along_y * dy**2).sum(-1)
+    xy = np.einsum("njhw,njh,njw->nj", p, dy, dx, optimize=True)
+    covariance = np.stack([xx, xy, xy, yy], -1).reshape(*at.shape[:2], 2, 2)
+    values, vectors = np.linalg.eigh(covariance)
+    values = np.maximum(values - target_sigma_cells**2, 0.01)
+    unblurred: Floats = (vectors * values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return unblurred
+
+
+def peak_beliefs(maps: NDArray[np.float32], best: NDArray[np.int64], kind: str) -> Floats:
+    """Belief in [0, 1] at each map's strongest cell, (N, J)."""
+    flat = maps.reshape(*maps.shape[:2], -1)
+    value = np.take_along_axis(flat, best[..., None], -1)[..., 0].astype(np.float64)
+    if kind == "logits":
+        value = 1 / (1 + np.exp(-np.clip(value, -30, 30)))
+    return np.clip(value, 0.0, 1.0)
+
+
+def confidence_features(
+    peak: Floats, covariance_cells2: Floats, p: Floats, best: NDArray[np.int64], background: Floats
+) -> Floats:
+    """What confidence is read from, (N, J, 5).
+
+    Logit of the peak belief (absence shows there, a normalised map has forgotten it), logarithm of
+    the spread, the mass within three cells of the peak, the background map's belief there, and the
+    mean peak over the joints (is there a person at all).
+    """
+    n, j, h, w = p.shape
+    y, x = np.divmod(best, w)
+    near_x = np.abs(np.arange(w) - x[..., None]) <= 3
+    near_y = np.abs(np.arange(h) - y[..., None]) <= 3
+    mass = np.einsum("njhw,njh,njw->nj", p, near_y.astype(float), near_x.astype(float))
+    logit = np.log(np.clip(peak, 1e-4, 1 - 1e-4) / (1 - np.clip(peak, 1e-4, 1 - 1e-4)))
+    area = np.log(np.trace(covariance_cells2, axis1=-2, axis2=-1) / (h * w) + 1e-6)
+    behind = np.take_along_axis(background.reshape(n, 1, -1), best.reshape(n, 1, j), -1)[:, 0]
+    person = np.broadcast_to(peak.mean(1, keepdims=True), peak.shape)
+    return np.stack([logit, area, mass, behind, person], -1)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What a batch of maps says, in cells: before scaling to a photo and before calibration.
+
+    ``at`` (N, J, 2), ``covariance`` (N, J, 2, 2), ``peak`` (N, J), ``features`` (N, J, F).
+    """
+
+    at: Floats
+    covariance: Floats
+    peak: Floats
+    features: Floats
+
+
+def read_maps(
+    maps: NDArray[np.float32], n_joints: int, kind: str, target_sigma_cells: float
+) -> Reading:
+    """Read a network's (N, n_joints + 1, h, w) maps, the last one being the background's."""
+    joint_maps = maps[:, :n_joints]
+    background = maps[:, n_joints].astype(np.float64)
+    if kind == "logits":
+        background = 1 / (1 + np.exp(-np.clip(background, -30, 30)))
+    p = marginals(joint_maps, kind)
+    at, best = sub_cell_peaks(p)
+    covariance = spread(p, at, target_sigma_cells)
+    peak = peak_beliefs(joint_maps, best, kind)
+    return Reading(at, covariance, peak, confidence_features(peak, covariance, p, best, background))
+
+
+def calibrated(features: Floats, coefficients: Floats) -> Floats:
+    """Logistic model: (N, J, F) features and (J, 1 + F) coefficients -> probability (N, J)."""
+    z = coefficients[:, 0] + (features * coefficients[:, 1:]).sum(-1)
+    probability: Floats = 1 / (1 + np.exp(-np.clip(z, -30, 30)))
+    return probability

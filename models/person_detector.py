@@ -1,0 +1,114 @@
+"""Finding the people in a photo: one pass of the person network over the whole, shrunk photo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from models.card import WEIGHTS_DIR, DetectorOutput, ModelCard
+from models.errors import ModelError
+from models.session import OnnxModel
+
+Floats = NDArray[np.float64]
+MAX_OVERLAP = 0.5
+"""Two boxes that overlap more (IoU) are one person."""
+
+
+@dataclass(frozen=True)
+class PersonBox:
+    """The box around a person's joints, in the photo's pixels, and how sure we are of it."""
+
+    x_px: float
+    y_px: float
+    width_px: float
+    height_px: float
+    score: float
+
+
+def iou(a: Floats, b: Floats) -> Floats:
+    """Intersection over union of corner boxes (N, 4) and (M, 4), (N, M)."""
+    low = np.maximum(a[:, None, :2], b[None, :, :2])
+    high = np.minimum(a[:, None, 2:], b[None, :, 2:])
+    overlap = np.clip(high - low, 0, None).prod(-1)
+    area_a = (a[:, 2:] - a[:, :2]).prod(-1)
+    area_b = (b[:, 2:] - b[:, :2]).prod(-1)
+    ratio: Floats = overlap / np.maximum(area_a[:, None] + area_b[None] - overlap, 1e-9)
+    return ratio
+
+
+def decode(
+    maps: NDArray[np.float32], stride: float, unit_px: float, threshold: float
+) -> tuple[Floats, Floats]:
+    """(5, h, w) maps -> corner boxes (n, 4) in input px and scores (n,), best first.
+
+    A person is a local maximum of the centre map; of boxes that overlap by more than MAX_OVERLAP
+    the best stays.
+    """
+    score = 1 / (1 + np.exp(-np.clip(maps[0].astype(np.float64), -30, 30)))
+    h, w = score.shape
+    padded = np.pad(score, 1)
+    around = np.max([padded[i : i + h, j : j + w] for i in range(3) for j in range(3)], axis=0)
+    y, x = np.nonzero((score >= around) & (score > threshold))
+    sides = np.exp(np.clip(maps[1:, y, x].astype(np.float64), -4, 4)) * unit_px
+    cx, cy = (x + 0.5) * stride - 0.5, (y + 0.5) * stride - 0.5
+    boxes = np.stack([cx - sides[0], cy - sides[1], cx + sides[2], cy + sides[3]], 1)
+    order = np.argsort(-score[y, x], kind="stable")
+    boxes, scores = boxes[order], score[y, x][order]
+    kept: list[int] = []
+    for i in range(len(boxes)):
+        if not kept or iou(boxes[i : i + 1], boxes[kept]).max() < MAX_OVERLAP:
+            kept.append(i)
+    return boxes[kept], scores[kept]
+
+
+class PersonDetector:
+    """The person network with its card. Thread-safe."""
+
+    def __init__(
+        self, name: str = "person", *, weights_dir: Path = WEIGHTS_DIR, threads: int = 1
+    ) -> None:
+        self._model = OnnxModel(weights_dir, name, threads=threads)
+        output = self._model.card.output
+        if not isinstance(output, DetectorOutput):
+            raise ModelError(f"model {name} is no person detector: its card says {output.kind}")
+        self._output = output
+
+    @property
+    def card(self) -> ModelCard:
+        """The network's model card."""
+        return self._model.card
+
+    def detect(self, image: NDArray[np.uint8], max_people: int) -> list[PersonBox]:
+        """People in a photo (H, W, 3) uint8 BGR, most certain first, at most ``max_people``."""
+        height, width = image.shape[:2]
+        scale = self._output.long_side_px / max(height, width)
+        small_w, small_h = max(1, round(width * scale)), max(1, round(height * scale))
+        way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+        small = cv2.resize(image, (small_w, small_h), interpolation=way)
+        # The pyramid halves five times.
+        canvas = np.zeros((1, -(-small_h // 32) * 32, -(-small_w // 32) * 32, 3), np.uint8)
+        canvas[0, :small_h, :small_w] = small
+        maps = self._model.run(canvas)[0]
+        boxes, scores = decode(
+            maps, self._output.stride_px, self._output.unit_px, self._output.threshold
+        )
+        ratio = np.array([width / small_w, height / small_h] * 2)
+        photo = (boxes + 0.5) * ratio - 0.5
+        limit = np.array([width, height] * 2) - 1.0
+        photo = np.clip(photo, 0.0, limit)
+        size = photo[:, 2:] - photo[:, :2]
+        return [
+            PersonBox(
+                x_px=float(box[0]),
+                y_px=float(box[1]),
+                width_px=float(wh[0]),
+                height_px=float(wh[1]),
+                score=float(score),
+            )
+            for box, wh, score in zip(photo, size, scores, strict=True)
+            if wh.min() > 1
+        ][:max_people]

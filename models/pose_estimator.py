@@ -1,0 +1,89 @@
+"""2D joints of every person: crops -> CPM -> heat maps -> joints in the photo's pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from library_store.skeleton import LSP14
+from models.card import WEIGHTS_DIR, ModelCard, PoseOutput
+from models.crop import square_crop
+from models.errors import ModelError
+from models.heatmaps import Floats, Joints2D, calibrated, read_maps
+from models.person_detector import PersonBox
+from models.session import OnnxModel
+
+
+class PoseEstimator:
+    """The Convolutional Pose Machine with its card. Thread-safe."""
+
+    def __init__(
+        self, name: str = "cpm", *, weights_dir: Path = WEIGHTS_DIR, threads: int = 1
+    ) -> None:
+        self._model = OnnxModel(weights_dir, name, threads=threads)
+        output = self._model.card.output
+        if not isinstance(output, PoseOutput):
+            raise ModelError(f"model {name} is no pose network: its card says {output.kind}")
+        if tuple(output.joint_names) != LSP14.joint_names:
+            raise ModelError(f"model {name} has other joints than lsp14: {output.joint_names}")
+        self._output = output
+
+    @property
+    def card(self) -> ModelCard:
+        """The network's model card."""
+        return self._model.card
+
+    @property
+    def provider(self) -> str:
+        """The onnxruntime execution provider in use."""
+        return self._model.provider
+
+    def estimate(self, image: NDArray[np.uint8], boxes: Sequence[PersonBox]) -> list[Joints2D]:
+        """Joints of the person in each box of a photo (H, W, 3) uint8 BGR, one batch for all."""
+        if not boxes:
+            return []
+        size = self._output.input_px
+        crops, scales, origins = [], [], []
+        for box in boxes:
+            center = (box.x_px + box.width_px / 2, box.y_px + box.height_px / 2)
+            side = max(box.width_px, box.height_px, 1.0) * self._output.crop_scale
+            crop, scale, origin = square_crop(image, center, side, size)
+            crops.append(crop)
+            scales.append(scale)
+            origins.append(origin)
+        return self.read(self._model.run(np.stack(crops)), scales, origins)
+
+    def read(
+        self,
+        maps: NDArray[np.float32],
+        scales: Sequence[float],
+        origins: Sequence[tuple[float, float]],
+    ) -> list[Joints2D]:
+        """Joints from the network's (N, 15, h, w) maps; photo = origin + scale * crop pixel."""
+        out = self._output
+        read = read_maps(maps, len(out.joint_names), out.maps, out.target_sigma_cells)
+        scale = np.asarray(scales, np.float64)
+        # The centre of cell c lies at crop pixel (c + 0.5) * stride - 0.5.
+        crop_px = (read.at + 0.5) * out.stride_px - 0.5
+        positions = np.asarray(origins)[:, None] + scale[:, None, None] * crop_px
+        covariance_px2 = read.covariance * (scale * out.stride_px)[:, None, None, None] ** 2
+        confidence: Floats | None = None
+        sigma: Floats | None = None
+        if out.confidence is not None:
+            confidence = calibrated(read.features, np.asarray(out.confidence.coefficients))
+        if out.spread is not None:
+            deviation = np.sqrt(np.trace(covariance_px2, axis1=-2, axis2=-1))
+            sigma = deviation * np.asarray(out.spread.factor)
+        return [
+            Joints2D(
+                positions_px=positions[i],
+                covariance_px2=covariance_px2[i],
+                confidence=None if confidence is None else confidence[i],
+                sigma_px=None if sigma is None else sigma[i],
+                peak=read.peak[i],
+            )
+            for i in range(len(maps))
+        ]

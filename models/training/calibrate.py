@@ -1,0 +1,184 @@
+"""Calibrate a pose network's confidence and spread, and measure it, through its ONNX file.
+
+``python -m models.training.calibrate --data DIR [--name cpm]`` runs on photos that training held
+out (whole photos, and the last crops of the labelled files): half of them fit, the other
+half check. Accuracy is that on lspet_val and on the held-out photos. All goes into the card.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from library_store.skeleton import LIMB_JOINTS
+from models.card import (
+    WEIGHTS_DIR,
+    ConfidenceCalibration,
+    ModelCard,
+    PoseOutput,
+    SpreadCalibration,
+    read_card,
+)
+from models.heatmaps import Floats, calibrated, read_maps
+from models.session import OnnxModel
+from models.training.augment import Sample, canonical, random_view
+from models.training.dataset import LabelledCrop
+from models.training.train import read_crops, torso_px
+
+NEAR = 0.2
+"""In torso lengths: what `confidence` is the probability of."""
+COVERAGE = 0.68
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Network readings of N crops beside their labels (J joints, F features)."""
+
+    features: Floats  # (N, J, F)
+    deviation_px: Floats  # (N, J)
+    error_px: Floats  # (N, J)
+    near: NDArray[np.bool_]  # (N, J) present and within NEAR
+    labelled: NDArray[np.bool_]  # (N, J) position known
+    judged: NDArray[np.bool_]  # (N, J) position known, or known to be outside
+
+
+def read_all(model: OnnxModel, output: PoseOutput, samples: list[Sample]) -> Readings:
+    """Run the network over samples of its input size."""
+    parts = []
+    for start in range(0, len(samples), 32):
+        chunk = samples[start : start + 32]
+        maps = model.run(np.stack([s.image for s in chunk]))
+        parts.append(
+            read_maps(maps, len(output.joint_names), output.maps, output.target_sigma_cells)
+        )
+    at = np.concatenate([r.at for r in parts])
+    covariance = np.concatenate([r.covariance for r in parts])
+    truth = np.stack([s.joints_px for s in samples])
+    weight = np.stack([s.weight for s in samples])
+    presence = np.stack([s.presence for s in samples])
+    error = np.linalg.norm((at + 0.5) * output.stride_px - 0.5 - truth, axis=-1)
+    labelled = weight > 0
+    return Readings(
+        features=np.concatenate([r.features for r in parts]),
+        deviation_px=np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)) * output.stride_px,
+        error_px=error,
+        near=labelled & (error < NEAR * torso_px(truth)[:, None]),
+        labelled=labelled,
+        judged=labelled | (presence == 0),
+    )
+
+
+def fit_confidence(data: Readings, ridge: float = 1.0, steps: int = 30) -> Floats:
+    """Logistic regression with slopes common to all joints, one intercept each; (J, 1 + F)."""
+    n_joints, n_features = data.features.shape[1:]
+    joint = np.broadcast_to(np.arange(n_joints), data.judged.shape)[data.judged]
+    x = np.concatenate([np.eye(n_joints)[joint], data.features[data.judged]], 1)
+    y = data.near[data.judged].astype(np.float64)
+    beta = np.zeros(n_joints + n_features)
+    for _ in range(steps):
+        p = 1 / (1 + np.exp(-np.clip(x @ beta, -30, 30)))
+        gradient = x.T @ (y - p) - ridge * beta
+        curvature = (x * (p * (1 - p))[:, None]).T @ x + ridge * np.eye(len(beta))
+        beta += np.linalg.solve(curvature, gradient)
+    slopes = np.broadcast_to(beta[n_joints:], (n_joints, n_features))
+    return np.concatenate([beta[:n_joints, None], slopes], 1)
+
+
+def calibration_error(probability: Floats, happened: NDArray[np.bool_], bins: int = 10) -> float:
+    """Expected calibration error: mean gap between stated and observed, over equal-width bins."""
+    index = np.minimum((probability * bins).astype(int), bins - 1)
+    gap = 0.0
+    for b in range(bins):
+        inside = index == b
+        if inside.any():
+            gap += inside.mean() * abs(probability[inside].mean() - happened[inside].mean())
+    return float(gap)
+
+
+def accuracy(data: Readings, joints: tuple[int, ...]) -> float:
+    """PCK@0.2 over the labelled ones of ``joints``."""
+    chosen = list(joints)
+    return float(data.near[:, chosen][data.labelled[:, chosen]].mean())
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--weights", type=Path, default=WEIGHTS_DIR)
+    parser.add_argument("--name", default="cpm")
+    parser.add_argument("--train", default="lspet_train_a,lspet_train_b,photos_a,photos_b")
+    parser.add_argument("--test", default="lspet_val")
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+
+    path = args.weights / f"{args.name}.json"
+    card = read_card(path)
+    output = card.output
+    if not isinstance(output, PoseOutput):
+        raise SystemExit(f"{path} is no pose network's card")
+    model = OnnxModel(args.weights, args.name)
+    _, kept = read_crops(args.data, args.train, args.test)
+    rng = np.random.default_rng(args.seed)
+
+    def views(crops: list[LabelledCrop]) -> Readings:
+        """Each crop as it is, and once cut off, covered or turned at random."""
+        samples = [canonical(crop, output.input_px) for crop in crops]
+        for crop in crops:
+            other = crops[int(rng.integers(len(crops)))]
+            samples.append(random_view(crop, other, output.input_px, rng))
+        return read_all(model, output, samples)
+
+    held = kept["photos_dev"] + kept["labelled_dev"]
+    fit, check = views(held[0::2]), views(held[1::2])
+    coefficients = fit_confidence(fit)
+    stated = calibrated(check.features, coefficients)
+    ece = calibration_error(stated[check.judged], check.near[check.judged])
+    ratio = fit.error_px / fit.deviation_px
+    factor = [
+        float(np.quantile(ratio[fit.labelled[:, j], j], COVERAGE)) for j in range(ratio.shape[1])
+    ]
+    covered = check.error_px < check.deviation_px * np.array(factor)
+    coverage = float(covered[check.labelled].mean())
+
+    measured: dict[str, float | str] = dict(card.measured)
+    for name in ["lspet_val", "photos_dev"]:
+        if name not in kept:
+            continue
+        data = read_all(model, output, [canonical(c, output.input_px) for c in kept[name]])
+        measured[f"pck_0.2/{name}/14_joints"] = round(accuracy(data, tuple(range(14))), 4)
+        measured[f"pck_0.2/{name}/12_limb_joints"] = round(accuracy(data, LIMB_JOINTS), 4)
+    measured["command"] = "python -m models.training.calibrate --data DIR"
+    held_text = "half of the held-out photos and labelled crops; checked on the other half"
+    updated = card.model_copy(
+        update={
+            "measured": measured,
+            "output": output.model_copy(
+                update={
+                    "confidence": ConfidenceCalibration(
+                        coefficients=[[round(float(v), 5) for v in row] for row in coefficients],
+                        fitted_on=held_text,
+                        expected_calibration_error=round(ece, 4),
+                    ),
+                    "spread": SpreadCalibration(
+                        factor=[round(f, 4) for f in factor],
+                        fitted_on=held_text,
+                        coverage=round(coverage, 4),
+                    ),
+                }
+            ),
+        }
+    )
+    path.write_text(ModelCard.model_validate(updated).model_dump_json(indent=2) + "\n")
+    print(measured)
+    print({"ece": round(ece, 4), "coverage_68": round(coverage, 4)})
+
+
+if __name__ == "__main__":
+    main()

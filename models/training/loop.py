@@ -1,0 +1,180 @@
+"""The training loop that both networks share: schedule, EMA, checkpoints, log.
+
+A run is seeded by step, so one that is stopped and resumed sees the samples it would have seen.
+Metrics go to ``log.jsonl``, the state to ``last.pt``, both in the output folder.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import math
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from models.training import optimizer as optim
+
+Model = TypeVar("Model", bound=nn.Module)
+Batch = tuple[Tensor, ...]
+EMA_DECAY = 0.998
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options every training program has."""
+    parser.add_argument("--data", type=Path, required=True, help="folder with the datasets")
+    parser.add_argument(
+        "--out", type=Path, required=True, help="folder of this run; resumed if any"
+    )
+    parser.add_argument("--init", type=Path, help="start from this checkpoint's averaged weights")
+    parser.add_argument("--steps", type=int, default=12000)
+    parser.add_argument("--minutes", type=float, help="bring the schedule to its end by then")
+    parser.add_argument("--batch", type=int, default=64)
+    parser.add_argument("--lr", type=float, default=2e-3, help="AdamW's; Muon's is ten times that")
+    parser.add_argument("--optimizer", choices=["muon", "adamw"], default="muon")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--every", type=int, default=500, help="steps between evaluations")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+
+
+def parse_sizes(text: str) -> list[tuple[float, int]]:
+    """``96:0.4,128:1`` -> [(0.4, 96), (1.0, 128)]: input size up to that share of the run."""
+    pairs = [part.split(":") for part in text.split(",")]
+    return [(float(until), int(size)) for size, until in pairs]
+
+
+def learning_rate(progress: float) -> float:
+    """Factor on the base rate: short warm-up, flat, then a straight way down to zero."""
+    if progress < 0.01:
+        return progress / 0.01
+    return min(1.0, max(0.0, (1 - progress) / 0.6))
+
+
+class Feeder:
+    """Makes the batches of the coming steps in a thread of its own."""
+
+    def __init__(self, make: Callable[[int], Batch], steps: range) -> None:
+        self._make, self._steps = make, steps
+        self._queue: queue.Queue[Batch | BaseException] = queue.Queue(4)
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self) -> None:
+        try:
+            for step in self._steps:
+                self._queue.put(self._make(step))
+        except BaseException as error:  # handed to the training thread, which raises it
+            self._queue.put(error)
+
+    def __iter__(self) -> Iterator[Batch]:
+        for _ in self._steps:
+            item = self._queue.get()
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+
+
+def _average_into(ema: nn.Module, model: nn.Module, decay: float) -> None:
+    with torch.no_grad():
+        for a, b in zip(ema.state_dict().values(), model.state_dict().values(), strict=True):
+            if a.dtype.is_floating_point:
+                a.lerp_(b, 1 - decay)
+            else:
+                a.copy_(b)
+
+
+def fit(
+    model: Model,
+    args: argparse.Namespace,
+    *,
+    sizes: list[tuple[float, int]],
+    make_batch: Callable[..., Batch],
+    loss_of: Callable[[Model, Batch], Tensor],
+    evaluate: Callable[[Model, int], dict[str, float]],
+    config: dict[str, object],
+) -> None:
+    """Train ``model`` as ``args`` says, resuming from ``args.out / last.pt`` when it is there.
+
+    ``make_batch(step, size=pixels)`` makes a batch on the CPU, ``loss_of(model, batch)`` its loss,
+    ``evaluate(averaged model, size_px)`` the metrics that are logged.
+    """
+    torch.manual_seed(args.seed)
+    torch.set_num_threads(args.threads)
+    args.out.mkdir(parents=True, exist_ok=True)
+    model = model.to(args.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    if args.init:
+        initial = torch.load(args.init, map_location=args.device, weights_only=True)
+        model.load_state_dict(initial["ema"])
+    ema = copy.deepcopy(model).eval()
+    optimizers = optim.build(model, args.optimizer, args.lr)
+    base_rates = [[g["lr"] for g in o.param_groups] for o in optimizers]
+    step, spent_s = 0, 0.0
+    last = args.out / "last.pt"
+    if last.exists():
+        state: dict[str, Any] = torch.load(last, map_location=args.device, weights_only=True)
+        model.load_state_dict(state["model"])
+        ema.load_state_dict(state["ema"])
+        for o, s in zip(optimizers, state["optimizers"], strict=True):
+            o.load_state_dict(s)
+        step, spent_s = state["step"], state["spent_s"]
+        print(f"resumed at step {step}", flush=True)
+    started = time.monotonic() - spent_s
+
+    def progress() -> float:
+        by_time = (time.monotonic() - started) / (60 * args.minutes) if args.minutes else 0.0
+        return max(step / args.steps, by_time)
+
+    running = math.nan
+    while progress() < 1:
+        size = next((size for until, size in sizes if progress() <= until), sizes[-1][1])
+        mark, mark_step = time.monotonic(), step
+        feeder = Feeder(partial(make_batch, size=size), range(step, step + args.every))
+        for batch in feeder:
+            factor = learning_rate(progress())
+            for o, rates in zip(optimizers, base_rates, strict=True):
+                for g, rate in zip(o.param_groups, rates, strict=True):
+                    g["lr"] = rate * factor
+            model.train()
+            loss = loss_of(model, tuple(t.to(args.device) for t in batch))
+            loss.backward()  # type: ignore[no-untyped-call]
+            for o in optimizers:
+                o.step()
+                o.zero_grad(set_to_none=True)
+            _average_into(ema, model, min(EMA_DECAY, (1 + step) / (10 + step)))
+            value = float(loss.detach())
+            running = value if math.isnan(running) else 0.98 * running + 0.02 * value
+            step += 1
+            if progress() >= 1:
+                break
+        rate = (step - mark_step) * args.batch / (time.monotonic() - mark)
+        line = {
+            "step": step,
+            "crops": step * args.batch,
+            "size_px": size,
+            "loss": round(running, 4),
+            "progress": round(progress(), 4),
+            "crops_per_s": round(rate, 1),
+            **{k: round(v, 4) for k, v in evaluate(ema, size).items()},
+        }
+        print(json.dumps(line), flush=True)
+        with (args.out / "log.jsonl").open("a") as log:
+            log.write(json.dumps(line) + "\n")
+        state = {
+            "model": model.state_dict(),
+            "ema": ema.state_dict(),
+            "optimizers": [o.state_dict() for o in optimizers],
+            "config": config,
+            "step": step,
+            "spent_s": time.monotonic() - started,
+            "size_px": size,
+        }
+        torch.save(state, last.with_suffix(".tmp"))
+        last.with_suffix(".tmp").replace(last)

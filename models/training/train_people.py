@@ -1,0 +1,158 @@
+"""Train the person network: ``python -m models.training.train_people --help``.
+
+Learns from mosaics of the labelled crops and from scenes that label_scenes.py has gone through.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
+
+from models.person_detector import decode, iou
+from models.training import loop
+from models.training.dataset import decode_members
+from models.training.network import PersonConfig, PersonNetwork
+from models.training.scenes import UNSURE, LabelledScene, SceneSample, mosaic, portrait, scene_view
+from models.training.train import read_crops
+
+DEV_ONE_IN = 8
+UNIT_PX = 32.0
+"""Distances to the box's sides are learned as logarithms of multiples of this."""
+
+
+def targets(
+    samples: list[SceneSample], stride: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Centre maps (B, h, w), distances (B, 4, h, w) px, weight of the distances (B, h, w)."""
+    h, w = samples[0].image.shape[0] // stride, samples[0].image.shape[1] // stride
+    heat = np.zeros((len(samples), h, w), np.float32)
+    sides = np.zeros((len(samples), 4, h, w), np.float32)
+    weight = np.zeros((len(samples), h, w), np.float32)
+    y, x = np.mgrid[0:h, 0:w].astype(np.float32)
+    cx, cy = (x + 0.5) * stride - 0.5, (y + 0.5) * stride - 0.5
+    for b, sample in enumerate(samples):
+        # Small boxes last: where people overlap, the one in front is usually the whole one.
+        for box in sorted(sample.boxes, key=lambda v: -float((v[2:] - v[:2]).prod())):
+            size = np.maximum(box[2:] - box[:2], 4.0)
+            # Sharp across, so that neighbours stay apart; never narrower than a cell.
+            sx, sy = np.maximum(0.12 * size, 0.6 * stride)
+            mx, my = (box[:2] + box[2:]) / 2
+            mx = (np.round((mx + 0.5) / stride - 0.5) + 0.5) * stride - 0.5
+            my = (np.round((my + 0.5) / stride - 0.5) + 0.5) * stride - 0.5
+            bump = np.exp(-(((cx - mx) / sx) ** 2 + ((cy - my) / sy) ** 2) / 2)
+            near = bump > np.maximum(weight[b], 0.3)
+            heat[b] = np.maximum(heat[b], bump)
+            offsets = np.stack([cx - box[0], cy - box[1], box[2] - cx, box[3] - cy])
+            sides[b][:, near] = offsets[:, near]
+            weight[b][near] = bump[near]
+    return heat, sides, weight
+
+
+def loss_from(out: Tensor, heat: Tensor, sides: Tensor, weight: Tensor, trust: Tensor) -> Tensor:
+    """CenterNet's focal loss on the centres plus 1 - IoU of the boxes."""
+    out = out.float()
+    logit = out[:, 0]
+    p = torch.sigmoid(logit)
+    centre = (heat > 0.999).float()
+    positive = -F.logsigmoid(logit) * (1 - p) ** 2 * centre
+    negative = -F.logsigmoid(-logit) * p**2 * (1 - heat) ** 4 * (1 - centre) * trust
+    n = centre.sum().clamp_min(1.0)
+    guess = torch.exp(out[:, 1:].clamp(-4, 4)) * UNIT_PX
+    truth = sides.clamp_min(1.0)
+    overlap = torch.minimum(guess[:, :2], truth[:, :2]) + torch.minimum(guess[:, 2:], truth[:, 2:])
+    inter = overlap.prod(1)
+    area_g = (guess[:, :2] + guess[:, 2:]).prod(1)
+    area_t = (truth[:, :2] + truth[:, 2:]).prod(1)
+    ratio = inter / (area_g + area_t - inter)
+    box = (-torch.log(ratio.clamp_min(1e-4)) * weight).sum() / weight.sum().clamp_min(1.0)
+    return (positive.sum() + negative.sum()) / n + box
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    loop.add_arguments(parser)
+    parser.add_argument("--train", default="lspet_train_a,lspet_train_b,photos_a,photos_b")
+    parser.add_argument("--scenes", default="photos_scenes.tar")
+    parser.add_argument("--scenes-labels", type=Path, required=True)
+    parser.add_argument("--canvas", default="320x256", help="training size, width x height")
+    args = parser.parse_args()
+
+    crops, _ = read_crops(args.data, args.train, "")
+    images = decode_members(args.data / args.scenes)
+    scenes = [
+        LabelledScene(images[r["image"]], np.array(r["people"], np.float32).reshape(-1, 5))
+        for r in json.loads(args.scenes_labels.read_text())
+    ]
+    dev, train = scenes[::DEV_ONE_IN], [s for i, s in enumerate(scenes) if i % DEV_ONE_IN]
+    empty = [s.image for s in train if not len(s.people) or s.people[:, 4].max() < UNSURE]
+    print({"crops": len(crops), "scenes": len(train), "empty": len(empty), "dev": len(dev)})
+    width, height = (int(v) for v in args.canvas.split("x"))
+    canvas, stride = (width, height), PersonNetwork.STRIDE
+
+    def to_batch(samples: list[SceneSample]) -> loop.Batch:
+        x = torch.from_numpy(np.stack([s.image for s in samples])).permute(0, 3, 1, 2)
+        x = x.float().mul_(1 / 127.5).sub_(1).contiguous(memory_format=torch.channels_last)
+        maps = [torch.from_numpy(a) for a in targets(samples, stride)]
+        return (x, *maps, torch.from_numpy(np.stack([s.trust for s in samples])))
+
+    def sample(rng: np.random.Generator) -> SceneSample:
+        dice = rng.random()
+        if dice < 0.4:
+            return scene_view(train[rng.integers(len(train))], canvas, rng)
+        if dice < 0.65:
+            return portrait(crops[rng.integers(len(crops))], canvas, rng)
+        return mosaic(crops, empty, canvas, rng)
+
+    def make_batch(step: int, size: int) -> loop.Batch:  # noqa: ARG001
+        rng = np.random.default_rng((args.seed, step))
+        return to_batch([sample(rng) for _ in range(args.batch)])
+
+    def loss_of(model: PersonNetwork, batch: loop.Batch) -> Tensor:
+        x, heat, sides, weight, trust = batch
+        with torch.autocast(args.device, torch.bfloat16):
+            out = model(x)
+        return loss_from(out, heat, sides, weight, trust)
+
+    def evaluate(model: PersonNetwork, _: int) -> dict[str, float]:
+        found = wanted = extra = 0
+        for scene in dev:
+            h, w = scene.image.shape[:2]
+            fit = min(width / w, height / h)
+            small = cv2.warpAffine(
+                scene.image, np.array([[fit, 0, 0], [0, fit, 0]]), canvas, flags=cv2.INTER_AREA
+            )
+            x = torch.from_numpy(small).permute(2, 0, 1)[None].float() / 127.5 - 1
+            with torch.no_grad():
+                out = model(x.to(args.device))[0].cpu().numpy()
+            boxes, _scores = decode(out, stride, UNIT_PX, 0.3)
+            sure = scene.people[scene.people[:, 4] >= 0.7]
+            ratio = iou(boxes / fit, sure[:, :4].astype(np.float64))
+            found += int((ratio.max(0, initial=0) > 0.5).sum())
+            wanted += len(sure)
+            known = iou(boxes / fit, scene.people[:, :4].astype(np.float64))
+            extra += int((known.max(1, initial=0) < 0.3).sum())
+        return {"recall": found / wanted, "unmatched_per_scene": extra / len(dev)}
+
+    cfg = PersonConfig()
+    loop.fit(
+        PersonNetwork(cfg),
+        args,
+        sizes=[(1.0, width)],
+        make_batch=make_batch,
+        loss_of=loss_of,
+        evaluate=evaluate,
+        config=cfg.as_dict(),
+    )
+
+
+if __name__ == "__main__":
+    main()
