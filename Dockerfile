@@ -29,7 +29,8 @@ ENV PATH=/opt/posematch/bin:$PATH \
     POSEMATCH_HOST=0.0.0.0 \
     POSEMATCH_PORT=8000 \
     POSEMATCH_CACHE_DIR=/var/cache/posematch
-USER posematch
+# useradd above; by number, so that hosts can check that it is not root.
+USER 10001
 WORKDIR /var/lib/posematch
 VOLUME /var/cache/posematch
 EXPOSE 8000

@@ -40,6 +40,7 @@ class Load:
     seconds: float = 0.0
     statuses: Counter[int] = field(default_factory=Counter)
     latencies_ms: list[float] = field(default_factory=list)
+    refusals_ms: list[float] = field(default_factory=list)
     stages_ms: dict[str, list[float]] = field(default_factory=dict)
 
 
@@ -127,14 +128,16 @@ async def _client(url: str, request: bytes, end: float, load: Load) -> None:
             head = await reader.readuntil(b"\r\n\r\n")
             length = re.search(rb"content-length: (\d+)", head, re.IGNORECASE)
             await reader.readexactly(int(length[1]) if length else 0)
+            spent_ms = 1e3 * (time.perf_counter() - started)
             status = int(head[9:12])
             load.statuses[status] += 1
             if status != 200:
+                load.refusals_ms.append(spent_ms)
                 await asyncio.sleep(0.02)  # what a polite client does at the least
                 continue
-            load.latencies_ms.append(1e3 * (time.perf_counter() - started))
-            for stage, spent_ms in _STAGE.findall(head):
-                load.stages_ms.setdefault(stage.decode(), []).append(float(spent_ms))
+            load.latencies_ms.append(spent_ms)
+            for stage, stage_ms in _STAGE.findall(head):
+                load.stages_ms.setdefault(stage.decode(), []).append(float(stage_ms))
     finally:
         writer.close()
 
@@ -159,9 +162,11 @@ def report(concurrency: int, load: Load, server_cpu_s: float, client_cpu_s: floa
         f" client {1e3 * client_cpu_s / answered:.1f}"
     )
     print(f"  {'ms':>8} {'p50':>8} {'p99':>8}")
-    for stage, spent_ms in {**load.stages_ms, "client": load.latencies_ms}.items():
-        p50, p99 = np.percentile(spent_ms, [50, 99])
-        print(f"  {stage:>8} {p50:8.2f} {p99:8.2f}")
+    rows = {**load.stages_ms, "client": load.latencies_ms, "refused": load.refusals_ms}
+    for stage, spent_ms in rows.items():
+        if spent_ms:
+            p50, p99 = np.percentile(spent_ms, [50, 99])
+            print(f"  {stage:>8} {p50:8.2f} {p99:8.2f}")
 
 
 if __name__ == "__main__":

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import struct
 import zlib
+from contextlib import suppress
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from app.errors import TooManyPixelsError, UndecodableImageError, UnsupportedImageTypeError
+from app.errors import (
+    RequestError,
+    TooManyPixelsError,
+    UndecodableImageError,
+    UnsupportedImageTypeError,
+)
 from app.imaging import Photo, decode_photo, read_header
 from app.imaging.exif import read_exif
 
@@ -199,6 +205,28 @@ def test_a_truncated_progressive_jpeg_is_refused() -> None:
 def test_bytes_after_the_end_are_ignored() -> None:
     for extension in (".jpg", ".png", ".webp"):
         decode(encode(scene(), extension) + b"<script>GIF89a\xff\xd8")
+
+
+@pytest.mark.parametrize("extension", [".jpg", ".png", ".webp"])
+def test_damaged_files_are_decoded_or_refused(extension: str) -> None:
+    """Whatever the bytes, there is a photo or one of our refusals, and soon."""
+    rng = np.random.default_rng(1)
+    whole = encode(scene(48, 64), extension)
+    for _ in range(1500):
+        data = bytearray(whole)
+        for _ in range(rng.integers(1, 6)):
+            at = int(rng.integers(len(data)))
+            match int(rng.integers(3)):
+                case 0:
+                    data[at] = rng.integers(256)
+                case 1:
+                    del data[at : at + int(rng.integers(1, 30))]
+                case _:
+                    data[at : at + 4] = b"\xff\xff\xff\xff"
+            if len(data) < 16:
+                break
+        with suppress(RequestError):
+            decode(bytes(data), max_pixels=1_000_000)
 
 
 @pytest.mark.parametrize(
