@@ -1,0 +1,122 @@
+"""Projective geometry of one person: rays, projection, turning the camera onto the person.
+
+Camera axes are OpenCV's: x right, y down, z forward; millimetres. *Normalised image coordinates*
+are those of a pinhole of focal length 1 with its principal point at (0, 0): ``x = X / Z``.
+
+A perspective camera sees the same pose differently at the edge of the photo than at its centre,
+while every exemplar was projected near the optical axis. So the person is first turned onto the
+axis (the picture a camera with the same centre, pointed at the person, would have taken), lifted
+there, and the answer turned back. Both steps are exact: a rotation about the camera centre.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Integers = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+
+
+def project(points_mm: Floats, focal_length_px: float, principal_point_px: Floats) -> Floats:
+    """Pinhole projection of camera-frame points.
+
+    Args:
+        points_mm: (..., 3) camera frame; z > 0.
+        focal_length_px: focal length, the same for both axes.
+        principal_point_px: (2,) pixel the optical axis meets.
+
+    Returns:
+        (..., 2) pixels.
+
+    """
+    return focal_length_px * normalised_projection(points_mm) + principal_point_px
+
+
+def unproject(
+    points_px: Floats, depths_mm: Floats, focal_length_px: float, principal_point_px: Floats
+) -> Floats:
+    """Inverse of :func:`project` at known depth: (..., 2) px and (...) mm -> (..., 3) mm."""
+    return lift_to_depth((points_px - principal_point_px) / focal_length_px, depths_mm)
+
+
+def normalised_projection(points_mm: Floats) -> Floats:
+    """(..., 3) camera-frame points -> (..., 2) normalised image coordinates."""
+    projected: Floats = points_mm[..., :2] / points_mm[..., 2:]
+    return projected
+
+
+def lift_to_depth(points: Floats, depths_mm: Floats) -> Floats:
+    """(..., 2) normalised image coordinates at (...) depths in mm -> (..., 3) mm."""
+    return np.concatenate([points * depths_mm[..., None], depths_mm[..., None]], axis=-1)
+
+
+def rotation_onto_axis(direction: Floats) -> Floats:
+    """Smallest rotation that turns ``direction`` (3,) with z > 0 onto +z; returns (3, 3)."""
+    x, y, z = direction / np.linalg.norm(direction)
+    # Rodrigues' formula for the axis d × e_z; 1 + cos > 1, so there is no degenerate case.
+    scale = 1.0 / (1.0 + z)
+    return np.array(
+        [
+            [1.0 - scale * x * x, -scale * x * y, -x],
+            [-scale * x * y, 1.0 - scale * y * y, -y],
+            [x, y, z],
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class CentredView:
+    """One person as a camera pointed straight at them would see them.
+
+    ``rotation`` (3, 3) takes the photo's camera frame to the centred one; ``points`` (14, 2) are
+    normalised image coordinates there; ``covariance`` (14, 2, 2) their uncertainty in the same
+    units squared, or None.
+    """
+
+    rotation: Floats
+    points: Floats
+    covariance: Floats | None
+
+    def to_photo(self, points_mm: Floats) -> Floats:
+        """(..., 3) centred-frame points or vectors -> the photo's camera frame."""
+        return points_mm @ self.rotation
+
+
+def centre_view(
+    joints_px: Floats,
+    weights: Floats,
+    covariance_px2: Floats | None,
+    focal_length_px: float,
+    principal_point_px: Floats,
+) -> CentredView:
+    """Turn the camera onto the weighted centre of a person's joints.
+
+    Args:
+        joints_px: (J, 2) pixels; rows of weight 0 may hold anything finite.
+        weights: (J,) in [0, 1], not all 0.
+        covariance_px2: (J, 2, 2) px² or None; carried over to first order.
+        focal_length_px: focal length.
+        principal_point_px: (2,).
+
+    Returns:
+        The centred view; rows of weight 0 lie on the axis.
+
+    """
+    present = weights > 0
+    flat = np.where(present[:, None], (joints_px - principal_point_px) / focal_length_px, 0.0)
+    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+    units = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    rotation = rotation_onto_axis(weights @ units)
+    turned = rays @ rotation.T
+    # A joint more than 90° from the person's own centre cannot be seen: it would be behind.
+    depth = np.maximum(turned[:, 2:], 1e-3)
+    points = np.where(present[:, None], turned[:, :2] / depth, 0.0)
+    covariance = None
+    if covariance_px2 is not None:
+        jacobian = (rotation[:2, :2] - points[:, :, None] * rotation[2, :2]) / depth[:, :, None]
+        covariance = jacobian @ covariance_px2 @ np.swapaxes(jacobian, 1, 2) / focal_length_px**2
+    return CentredView(rotation, points, covariance)

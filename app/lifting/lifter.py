@@ -1,0 +1,334 @@
+"""From 2D joints to 3D people: match (eq. 4) → camera (eq. 5) → warp (eq. 6), and fusion.
+
+People are lifted one by one, each batched over its candidates: the answer for a person is the same
+bytes whoever else is in the call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from app.lifting.calibration import FUSION_SIGMA, SigmaCalibration
+from app.lifting.fusion import FusedPose, FusionSettings, fuse, place_ensemble
+from app.lifting.geometry import CentredView, Floats, Integers, Mask, centre_view, project
+from app.lifting.posterior import shortlist_probabilities, standard_px_per_unit
+from app.lifting.resection import Cameras, resect
+from app.lifting.stature import stature_mm
+from app.lifting.types import (
+    Hypothesis,
+    Intrinsics,
+    LiftedPerson,
+    Method,
+    NotLiftable,
+    Observation,
+    ScaleSource,
+)
+from app.lifting.warp import warp_perspective, warp_weak_perspective
+from library_store.library import Library
+from library_store.skeleton import L_HIP, L_SHOULDER, NECK, R_HIP, R_SHOULDER
+
+MIN_JOINTS = 6
+"""A camera has six unknowns; with fewer joints (two equations each) every exemplar fits."""
+MIN_TRUNK_JOINTS = 2
+"""Of shoulders, hips and neck: without them limbs hang on nothing."""
+TRUNK = (NECK, R_SHOULDER, L_SHOULDER, R_HIP, L_HIP)
+MIN_EXTENT_PX = 8.0
+"""Larger side of the joints' bounding box, pixels of the photo."""
+
+
+@dataclass(frozen=True)
+class LiftingSettings:
+    """Constants of lifting.
+
+    σ(library) maximises the probability eq. 4 gives to the candidate that is truly nearest in 3D,
+    over held-out people at 0, 5 and 10 px of known noise (``evaluation.calibration``); it is wide:
+    the image tells thirty close candidates apart poorly (mean log probability -2.98; -3.40 is
+    chance).
+
+    ``shortlist``, ``paper_shortlist``: k of eq. 4 for the two methods; ``neighbours``: ensemble of
+    the fusion, ``masked_neighbours`` the same where joints are missing, for that search costs more;
+    ``least_confidence``: joints below it count as missing; ``sigma_library_px``, ``sigma_2d_px``:
+    the two parts of eq. 4's σ in standard pixels a coordinate, the latter where the 2D's own
+    covariance is unknown; ``far_px``: RMS residual of the best candidate, in standard pixels,
+    beyond which a person is ``far_from_library`` (1 in 100 held-out people);
+    ``resection_iterations``: Levenberg-Marquardt steps; ``max_outliers``: joints that may be set
+    aside as contradicting the rest; ``sigma``: what makes the posterior's spread a radius, None for
+    no ``sigma_mm``.
+    """
+
+    shortlist: int = 30
+    paper_shortlist: int = 10
+    neighbours: int = 200
+    masked_neighbours: int = 60
+    least_confidence: float = 0.2
+    sigma_library_px: float = 30.0
+    sigma_2d_px: float = 6.5
+    far_px: float = 35.0
+    resection_iterations: int = 3
+    max_outliers: int = 2
+    fusion: FusionSettings = field(default_factory=FusionSettings)
+    sigma: SigmaCalibration | None = FUSION_SIGMA
+
+
+@dataclass(frozen=True)
+class _Neighbours:
+    """What eq. 4 finds for one person, nearest first: (K,), (K,), (K, 14, 3), (K, 3, 3)."""
+
+    entries: Integers
+    distances: Floats
+    poses_mm: Floats
+    rotations: Floats
+
+
+@dataclass(frozen=True)
+class _Shortlist:
+    """Candidates of one person, most probable first; everything in the centred view."""
+
+    entries: Integers
+    distances: Floats
+    cameras: Cameras
+    probabilities: Floats
+    rms_px: float
+
+
+class Lifter:
+    """Lifts people with one library; immutable and safe to share between threads."""
+
+    def __init__(self, library: Library, settings: LiftingSettings | None = None) -> None:
+        self._library = library
+        self._settings = settings or LiftingSettings()
+
+    def lift(
+        self,
+        observations: Sequence[Observation],
+        intrinsics: Intrinsics,
+        *,
+        method: Method = "fusion",
+        subject_height_mm: float | None = None,
+        n_candidates: int = 3,
+        lap: Callable[[str], None] | None = None,
+    ) -> list[LiftedPerson | NotLiftable]:
+        """Lift people seen by one camera.
+
+        Args:
+            observations: the people.
+            intrinsics: of the photo.
+            method: ``paper``: the best of 10 exemplars warped by eq. 6; ``fusion``: the posterior
+                mean over a few hundred neighbours.
+            subject_height_mm: the people's standing height; scales all lengths about the camera
+                centre, which changes no image. None: the library's body size.
+            n_candidates: how many hypotheses to return; never changes the answer.
+            lap: called with ``match``, ``camera`` or ``warp`` whenever a piece of that stage ends.
+
+        Returns:
+            One result per observation, in order.
+
+        """
+        return [
+            self._lift_person(
+                person, intrinsics, method, subject_height_mm, n_candidates, lap or _no_lap
+            )
+            for person in observations
+        ]
+
+    def _lift_person(
+        self,
+        person: Observation,
+        intrinsics: Intrinsics,
+        method: Method,
+        subject_height_mm: float | None,
+        n_candidates: int,
+        lap: Callable[[str], None],
+    ) -> LiftedPerson | NotLiftable:
+        settings = self._settings
+        confidence = np.where(
+            person.confidence >= settings.least_confidence, person.confidence, 0.0
+        )
+        refusal = _why_not_liftable(person.joints_px, confidence)
+        if refusal is not None:
+            return NotLiftable(refusal, ("truncated",))
+        warnings = ["assumed_focal"] if intrinsics.source == "assumed" else []
+        if (confidence == 0).any():
+            warnings.append("truncated")
+
+        outliers = 0
+        while True:
+            view = centre_view(
+                person.joints_px,
+                confidence,
+                person.covariance_px2,
+                intrinsics.focal_length_px,
+                np.array(intrinsics.principal_point_px),
+            )
+            neighbours = self._neighbours(view, confidence > 0, method)
+            lap("match")
+            if method == "paper":
+                break
+            fused = self._fuse(view, confidence, neighbours)
+            lap("warp")
+            if fused.outlier is None or outliers == settings.max_outliers:
+                break
+            without = confidence.copy()
+            without[fused.outlier] = 0.0
+            if _why_not_liftable(person.joints_px, without) is not None:
+                break
+            # Its neighbours were found with the contradicting joint: match again without it.
+            confidence, outliers = without, outliers + 1
+        if outliers:
+            warnings.append("inconsistent_joints")
+
+        shortlist = self._shortlist(view, confidence, neighbours)
+        lap("camera")
+        if shortlist.rms_px > settings.far_px:
+            warnings.append("far_from_library")
+        best = shortlist.cameras.points_mm[0]
+        present = confidence > 0
+        if method == "paper":
+            warped = answer = warp_weak_perspective(best, view.points, present)
+            sigma = None
+        else:
+            warped, answer = warp_perspective(best, view.points, present), fused.joints_mm
+            sigma = settings.sigma(fused.spread_mm) if settings.sigma is not None else None
+        answer, warped = view.to_photo(answer), view.to_photo(warped)
+        scale_source: ScaleSource = "library"
+        if subject_height_mm is not None:
+            scale_source = "request"
+            scale = subject_height_mm / float(stature_mm(answer))
+            answer = answer * scale
+            sigma = None if sigma is None else sigma * scale
+            warped = warped * (subject_height_mm / float(stature_mm(warped)))
+        candidates = self._hypotheses(
+            shortlist, view, person, confidence, intrinsics, subject_height_mm, max(n_candidates, 1)
+        )
+        lap("warp")
+        return LiftedPerson(
+            exemplar=candidates[0],
+            warped_mm=warped,
+            candidates=candidates[:n_candidates],
+            joints_3d_mm=answer,
+            sigma_mm=sigma,
+            root_mm=0.5 * (answer[R_HIP] + answer[L_HIP]),
+            scale_source=scale_source,
+            warnings=tuple(warnings),
+        )
+
+    def _neighbours(self, view: CentredView, present: Mask, method: Method) -> _Neighbours:
+        """Eq. 4's nearest exemplars, of the joints that are present."""
+        settings = self._settings
+        k = settings.neighbours if present.all() else settings.masked_neighbours
+        if method == "paper":
+            k = settings.paper_shortlist
+        matches = self._library.match(view.points[None], present[None].astype(np.float64), k)
+        entries = matches.entries[0]
+        return _Neighbours(
+            entries=entries,
+            distances=matches.distances[0],
+            poses_mm=self._library.poses_mm(entries),
+            rotations=self._library.cameras(entries)[0],
+        )
+
+    def _fuse(self, view: CentredView, confidence: Floats, neighbours: _Neighbours) -> FusedPose:
+        weights = (confidence > 0).astype(np.float64)
+        ensemble = place_ensemble(neighbours.poses_mm, neighbours.rotations, view.points, weights)
+        covariance = view.covariance
+        if covariance is not None:
+            covariance = covariance * ensemble.px_per_unit**2
+        return fuse(ensemble, view.points, confidence, covariance, self._settings.fusion)
+
+    def _shortlist(
+        self, view: CentredView, confidence: Floats, neighbours: _Neighbours
+    ) -> _Shortlist:
+        """Eq. 5 for the k nearest, sorted by eq. 4 with M*."""
+        settings = self._settings
+        k = settings.shortlist
+        cameras = resect(
+            neighbours.poses_mm[:k],
+            neighbours.rotations[:k],
+            view.points,
+            confidence,
+            iterations=settings.resection_iterations,
+        )
+        px = standard_px_per_unit(
+            float(np.sort(cameras.translation_mm[:, 2])[len(cameras.translation_mm) // 2])
+        )
+        residuals = px * cameras.residuals
+        if view.covariance is None:
+            covariance = np.broadcast_to(settings.sigma_2d_px**2 * np.eye(2), (14, 2, 2))
+        else:
+            covariance = px**2 * view.covariance
+        probabilities = shortlist_probabilities(
+            residuals, confidence, covariance, settings.sigma_library_px
+        )
+        order = np.argsort(-probabilities, kind="stable")
+        squared = (residuals[order[0]] ** 2).sum(-1)
+        return _Shortlist(
+            entries=neighbours.entries[:k][order],
+            distances=neighbours.distances[:k][order],
+            cameras=Cameras(
+                cameras.rotation[order],
+                cameras.translation_mm[order],
+                cameras.points_mm[order],
+                cameras.residuals[order],
+            ),
+            probabilities=probabilities[order],
+            rms_px=float(np.sqrt((confidence * squared).sum() / confidence.sum())),
+        )
+
+    def _hypotheses(
+        self,
+        shortlist: _Shortlist,
+        view: CentredView,
+        person: Observation,
+        confidence: Floats,
+        intrinsics: Intrinsics,
+        subject_height_mm: float | None,
+        n: int,
+    ) -> tuple[Hypothesis, ...]:
+        """The n most probable candidates in the photo's camera frame."""
+        present = confidence > 0
+        hypotheses = []
+        for rank, entry in enumerate(shortlist.entries[:n]):
+            joints = view.to_photo(shortlist.cameras.points_mm[rank])
+            pixels = project(
+                joints, intrinsics.focal_length_px, np.array(intrinsics.principal_point_px)
+            )
+            error = ((pixels[present] - person.joints_px[present]) ** 2).sum(-1)
+            scale = 1.0
+            if subject_height_mm is not None:
+                scale = subject_height_mm / float(stature_mm(joints))
+            hypotheses.append(
+                Hypothesis(
+                    entry=int(entry),
+                    exemplar_id=self._library.exemplar_id(int(entry)),
+                    source=self._library.source(int(entry)),
+                    probability=float(shortlist.probabilities[rank]),
+                    distance=float(shortlist.distances[rank]),
+                    reprojection_error_px=float(np.sqrt(error.mean())),
+                    rotation=view.rotation.T @ shortlist.cameras.rotation[rank],
+                    translation_mm=scale * view.to_photo(shortlist.cameras.translation_mm[rank]),
+                    joints_mm=scale * joints,
+                )
+            )
+        return tuple(hypotheses)
+
+
+def _no_lap(_: str) -> None:
+    """Nobody measures."""
+
+
+def _why_not_liftable(joints_px: Floats, confidence: Floats) -> str | None:
+    """Why joints of these confidences do not determine a pose, or None if they do."""
+    present = confidence > 0
+    if present.sum() < MIN_JOINTS:
+        return f"{int(present.sum())} joints are visible; at least {MIN_JOINTS} are needed"
+    if present[list(TRUNK)].sum() < MIN_TRUNK_JOINTS:
+        return (
+            f"fewer than {MIN_TRUNK_JOINTS} of neck, shoulders and hips are visible: "
+            "limbs alone do not place a body"
+        )
+    if np.ptp(joints_px[present], axis=0).max() < MIN_EXTENT_PX:
+        return f"the joints lie within {MIN_EXTENT_PX:g} pixels of each other"
+    return None

@@ -1,0 +1,156 @@
+"""Fit the lifter's calibration constants, and check them on people they were not fitted on.
+
+    python -m evaluation.calibration --library DIR --data heldout.npz [--check other.npz]
+
+Constants are fitted on the even-numbered people of ``--data`` at all its noise levels together and
+checked on the odd-numbered ones and on ``--check``; the library must not hold these people. Prints
+``SigmaCalibration`` for ``app.lifting.calibration`` and σ(library), σ(2D) of eq. 4 for
+``LiftingSettings``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from app.lifting.calibration import SigmaCalibration
+from app.lifting.lifter import Lifter, LiftingSettings
+from evaluation.lifting import Lifted, lift_all
+from evaluation.metrics import Floats, rigid_error_mm, root_centred_error_mm
+from evaluation.protocols import LiftingSet, clean, load_lifting_set
+from library_store.library import Library, load
+
+COVERAGE = 0.68
+LIBRARY_SIGMAS_PX = (10.0, 15.0, 20.0, 30.0, 40.0, 55.0, 80.0)
+STATED_FLOOR_PX = 0.5
+FLOORS_MM = (0.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0)
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Posterior spread and root-relative error, each (N, 14) mm."""
+
+    spread_mm: Floats
+    error_mm: Floats
+
+    def split(self) -> tuple[Errors, Errors]:
+        """Even-numbered and odd-numbered people."""
+        return (
+            Errors(self.spread_mm[::2], self.error_mm[::2]),
+            Errors(self.spread_mm[1::2], self.error_mm[1::2]),
+        )
+
+
+def fit_sigma(errors: Errors) -> SigmaCalibration:
+    """Factors that give each joint 68% coverage, and the floor that does so most sharply.
+
+    Sharpness is the pinball loss of the 68% quantile, the proper score for that radius.
+    """
+    best: tuple[float, SigmaCalibration] | None = None
+    for floor in FLOORS_MM:
+        ratio = errors.error_mm / np.sqrt(errors.spread_mm**2 + floor**2)
+        factors = np.quantile(ratio, COVERAGE, axis=0)
+        candidate = SigmaCalibration(tuple(round(float(f), 3) for f in factors), floor)
+        excess = errors.error_mm - candidate(errors.spread_mm)
+        loss = float(np.maximum(COVERAGE * excess, (COVERAGE - 1.0) * excess).mean())
+        if best is None or loss < best[0]:
+            best = loss, candidate
+    assert best is not None
+    return best[1]
+
+
+def collect_errors(library: Library, data: LiftingSet, settings: LiftingSettings) -> list[Errors]:
+    """Spread and error of the fused answer at every noise level."""
+    raw = replace(settings, sigma=SigmaCalibration((1.0,) * 14, 0.0))
+    collected = []
+    for points in data.joints_2d_px.values():
+        lifted = lift_all(Lifter(library, raw), clean(points), data.intrinsics, "fusion")
+        assert lifted.sigma_mm is not None
+        error = root_centred_error_mm(lifted.joints_mm, data.joints_3d_mm)
+        collected.append(Errors(lifted.sigma_mm, error))
+    return collected
+
+
+def log_score(lifted: Lifted, truth: Floats) -> Floats:
+    """Log probability given to the candidate that is truly nearest (P1), per person."""
+    scores = []
+    for person, pose in zip(lifted.people, truth, strict=True):
+        joints = np.stack([candidate.joints_mm for candidate in person.candidates])
+        nearest = int(np.argmin(rigid_error_mm(joints, pose[None]).mean(1)))
+        scores.append(np.log(max(person.candidates[nearest].probability, 1e-300)))
+    return np.array(scores)
+
+
+def mean_log_score(
+    library: Library, data: LiftingSet, settings: LiftingSettings, *, stated: bool
+) -> Floats:
+    """Mean of :func:`log_score` over people, by noise level."""
+    lifter = Lifter(library, settings)
+    means = []
+    for noise, points in data.joints_2d_px.items():
+        sigma = max(float(noise), STATED_FLOOR_PX) if stated else None
+        observations = list(clean(points).observations(sigma))
+        answers = lifter.lift(observations, data.intrinsics, n_candidates=settings.shortlist)
+        lifted = Lifted.of(answers, cpu_ms=0.0)
+        means.append(log_score(lifted, data.joints_3d_mm).mean())
+    return np.array(means)
+
+
+def pooled(parts: Sequence[Errors]) -> Errors:
+    """All noise levels as one sample."""
+    return Errors(
+        np.concatenate([part.spread_mm for part in parts]),
+        np.concatenate([part.error_mm for part in parts]),
+    )
+
+
+def report_coverage(label: str, calibration: SigmaCalibration, parts: Sequence[Errors]) -> None:
+    """Print coverage by noise level, and the rank correlation of sigma with error by person."""
+    for level, part in enumerate(parts):
+        sigma = calibration(part.spread_mm)
+        ranks = np.array([np.argsort(np.argsort(v.mean(1))) for v in (sigma, part.error_mm)])
+        print(
+            f"{label}, noise level {level}: covers {(part.error_mm <= sigma).mean():.1%}, "
+            f"sigma {sigma.mean():.0f} mm, Spearman {np.corrcoef(ranks)[0, 1]:.2f}"
+        )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line: see the module."""
+    parser = argparse.ArgumentParser(prog="evaluation.calibration", description=__doc__)
+    parser.add_argument("--library", type=Path, required=True)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--check", type=Path, action="append", default=[])
+    parser.add_argument("--people", type=int, default=None, help="only the first N of each set")
+    chosen = parser.parse_args(arguments)
+    library, settings = load(chosen.library), LiftingSettings()
+    data = load_lifting_set(chosen.data).first(chosen.people)
+
+    halves = [errors.split() for errors in collect_errors(library, data, settings)]
+    calibration = fit_sigma(pooled([half[0] for half in halves]))
+    print(calibration)
+    report_coverage("fitted half", calibration, [half[0] for half in halves])
+    report_coverage("other half", calibration, [half[1] for half in halves])
+    for path in chosen.check:
+        other = load_lifting_set(path).first(chosen.people)
+        report_coverage(other.name, calibration, collect_errors(library, other, settings))
+
+    fit, check = data.half(0), data.half(1)
+    for stated in (True, False):
+        print("2D noise stated:" if stated else "2D noise unknown:")
+        for sigma in LIBRARY_SIGMAS_PX:
+            one = replace(settings, sigma_library_px=sigma, sigma_2d_px=0.0)
+            scores = [mean_log_score(library, half, one, stated=stated) for half in (fit, check)]
+            by_noise = " ".join(f"{score:.3f}" for score in scores[0])
+            print(
+                f"  sigma {sigma:g}: log P of the nearest candidate {scores[0].mean():.3f} "
+                f"(by noise {by_noise}), other half {scores[1].mean():.3f}"
+            )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+
+from app.lifting.geometry import (
+    centre_view,
+    normalised_projection,
+    project,
+    rotation_onto_axis,
+    unproject,
+)
+
+RNG = np.random.default_rng(0)
+
+
+def test_unproject_undoes_project() -> None:
+    points = RNG.normal(size=(50, 14, 3)) * 500 + [0, 0, 4000]
+    principal = np.array([319.5, 239.5])
+    pixels = project(points, 900.0, principal)
+    np.testing.assert_allclose(unproject(pixels, points[..., 2], 900.0, principal), points)
+
+
+@pytest.mark.parametrize("direction", [[0.0, 0.0, 1.0], [0.7, -0.2, 1.0], [-3.0, 2.0, 0.01]])
+def test_rotation_onto_axis_is_a_rotation_onto_the_axis(direction: list[float]) -> None:
+    rotation = rotation_onto_axis(np.array(direction))
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    turned = rotation @ direction
+    np.testing.assert_allclose(turned[:2], 0.0, atol=1e-12)
+    assert turned[2] > 0
+
+
+def test_centred_view_is_what_a_turned_camera_sees() -> None:
+    points = RNG.normal(size=(14, 3)) * 400 + [2500, -700, 4000]
+    principal = np.array([320.0, 240.0])
+    view = centre_view(project(points, 800.0, principal), np.ones(14), None, 800.0, principal)
+    turned = points @ view.rotation.T
+    np.testing.assert_allclose(normalised_projection(turned), view.points, atol=1e-12)
+    np.testing.assert_allclose(view.to_photo(turned), points, atol=1e-9)
+    assert np.abs(view.points.mean(0)).max() < 0.03
+
+
+def test_missing_joints_do_not_move_the_view() -> None:
+    pixels = RNG.normal(size=(14, 2)) * 100 + 500
+    weights = np.ones(14)
+    weights[3] = 0.0
+    elsewhere = pixels.copy()
+    elsewhere[3] = np.nan
+    views = [centre_view(p, weights, None, 800.0, np.zeros(2)) for p in (pixels, elsewhere)]
+    np.testing.assert_array_equal(views[0].points, views[1].points)
+
+
+def test_covariance_is_carried_to_the_centred_view() -> None:
+    pixels = RNG.normal(size=(14, 2)) * 80 + [900, -300]
+    covariance = np.broadcast_to(np.array([[9.0, 2.0], [2.0, 4.0]]), (14, 2, 2))
+    principal = np.zeros(2)
+    view = centre_view(pixels, np.ones(14), covariance, 700.0, principal)
+    assert view.covariance is not None
+    noise = RNG.multivariate_normal([0, 0], covariance[0], size=(20_000,))
+    moved = np.concatenate([(pixels[5] + noise) / 700.0, np.ones((len(noise), 1))], axis=1)
+    turned = moved @ view.rotation.T
+    measured = np.cov((turned[:, :2] / turned[:, 2:]).T)
+    np.testing.assert_allclose(view.covariance[5], measured, rtol=0.06, atol=1e-7)

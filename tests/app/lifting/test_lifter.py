@@ -1,0 +1,256 @@
+"""Invariants of the whole lift, on a small real library."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from app.lifting.geometry import project, rotation_onto_axis
+from app.lifting.lifter import Lifter
+from app.lifting.stature import stature_mm
+from app.lifting.types import Intrinsics, LiftedPerson, Method, NotLiftable, Observation
+from app.lifting.warp import warp_weak_perspective
+from evaluation.metrics import rigid_error_mm, root_centred_error_mm
+from library_store.library import Library
+from library_store.skeleton import LSP14
+from tests.app.lifting.conftest import INTRINSICS, People, lift_one, observe, project_px
+
+METHODS: tuple[Method, ...] = ("fusion", "paper")
+
+
+def same(a: LiftedPerson, b: LiftedPerson) -> bool:
+    def answer(person: LiftedPerson) -> tuple[object, ...]:
+        sigma = None if person.sigma_mm is None else person.sigma_mm.tobytes()
+        exemplar = person.exemplar
+        return (
+            person.joints_3d_mm.tobytes(),
+            person.warped_mm.tobytes(),
+            (exemplar.exemplar_id, exemplar.probability, exemplar.rotation.tobytes()),
+            sigma,
+            person.warnings,
+        )
+
+    return answer(a) == answer(b)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_exemplar_seen_by_its_own_camera_is_found(
+    library: Library, lifter: Lifter, method: Method
+) -> None:
+    for entry in (0, 1234, 3999):
+        rotation, translation = library.cameras(entry)
+        placed = library.poses_mm(entry) @ rotation.T + translation
+        person = lift_one(lifter, observe(project_px(placed)), method=method, n_candidates=50)
+        assert person.exemplar.entry == entry
+        assert library.find(person.exemplar.exemplar_id) == entry
+        assert person.exemplar.reprojection_error_px < 0.05
+        np.testing.assert_allclose(person.exemplar.joints_mm, placed, atol=2.0)
+        probabilities = [candidate.probability for candidate in person.candidates]
+        assert sum(probabilities) == pytest.approx(1.0)
+        assert np.isfinite(probabilities).all()
+        assert probabilities == sorted(probabilities, reverse=True)
+        assert person.candidates[0] is person.exemplar
+
+
+def test_camera_places_the_exemplar(library: Library, lifter: Lifter, people: People) -> None:
+    best = lift_one(lifter, people.observation(0)).exemplar
+    placed = library.poses_mm(best.entry) @ best.rotation.T + best.translation_mm
+    np.testing.assert_allclose(best.joints_mm, placed, atol=1e-6)
+    error = ((project_px(placed) - people.joints_px[0]) ** 2).sum(1)
+    assert best.reprojection_error_px == pytest.approx(np.sqrt(error.mean()))
+
+
+def test_paper_answer_is_equation_6_on_axis(lifter: Lifter, people: People) -> None:
+    # A person whose joints centre on the principal point needs no turning.
+    pixels = people.joints_px[3]
+    person = lift_one(lifter, observe(pixels), method="paper")
+    np.testing.assert_array_equal(person.joints_3d_mm, person.warped_mm)
+    assert person.sigma_mm is None
+    rays = np.c_[(pixels - INTRINSICS.principal_point_px) / INTRINSICS.focal_length_px, np.ones(14)]
+    turn = rotation_onto_axis((rays / np.linalg.norm(rays, axis=1, keepdims=True)).sum(0))
+    turned = rays @ turn.T
+    exemplar = person.exemplar.joints_mm @ turn.T
+    expected = warp_weak_perspective(exemplar, turned[:, :2] / turned[:, 2:], np.ones(14, bool))
+    np.testing.assert_allclose(person.joints_3d_mm, expected @ turn, atol=1e-6)
+
+
+def test_fusions_warped_exemplar_reprojects_exactly(lifter: Lifter, people: People) -> None:
+    person = lift_one(lifter, people.observation(5))
+    np.testing.assert_allclose(project_px(person.warped_mm), people.joints_px[5], atol=1e-9)
+
+
+def test_fusion_beats_the_paper(lifter: Lifter, people: People) -> None:
+    errors = {}
+    for method in METHODS:
+        lifted = [
+            lift_one(lifter, people.observation(i), method=method).joints_3d_mm
+            for i in range(len(people.joints_px))
+        ]
+        errors[method] = rigid_error_mm(np.stack(lifted), people.joints_mm).mean()
+    assert errors["fusion"] < 0.9 * errors["paper"]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_same_bytes_whatever_is_asked_beside(
+    lifter: Lifter, people: People, method: Method
+) -> None:
+    observations = [people.observation(i) for i in range(6)]
+    together = lifter.lift(observations, INTRINSICS, method=method, n_candidates=7)
+    for observation, one in zip(observations, together, strict=True):
+        assert isinstance(one, LiftedPerson)
+        assert len(one.candidates) == 7
+        assert same(one, lift_one(lifter, observation, method=method, n_candidates=0))
+        assert same(one, lift_one(lifter, observation, method=method, n_candidates=50))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_subject_height_is_met_exactly_and_changes_no_image(
+    lifter: Lifter, people: People, method: Method
+) -> None:
+    plain = lift_one(lifter, people.observation(2), method=method)
+    scaled = lift_one(lifter, people.observation(2), method=method, subject_height_mm=1900.0)
+    assert (plain.scale_source, scaled.scale_source) == ("library", "request")
+    for joints in (scaled.joints_3d_mm, scaled.warped_mm, scaled.exemplar.joints_mm):
+        assert stature_mm(joints) == pytest.approx(1900.0)
+    np.testing.assert_allclose(
+        project_px(scaled.joints_3d_mm), project_px(plain.joints_3d_mm), atol=1e-8
+    )
+    ratio = scaled.joints_3d_mm / plain.joints_3d_mm
+    np.testing.assert_allclose(ratio, ratio[0, 2])
+    np.testing.assert_allclose(scaled.root_mm, ratio[0, 2] * plain.root_mm)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_moving_photo_and_principal_point_together_changes_nothing(
+    lifter: Lifter, people: People, method: Method
+) -> None:
+    shift = np.array([250.0, -75.0])
+    centre = np.array(INTRINSICS.principal_point_px) + shift
+    moved = Intrinsics(INTRINSICS.focal_length_px, (centre[0], centre[1]), "request")
+    for i in range(4):
+        here = lift_one(lifter, people.observation(i), method=method)
+        there = lift_one(lifter, observe(people.joints_px[i] + shift), moved, method)
+        np.testing.assert_allclose(there.joints_3d_mm, here.joints_3d_mm, atol=1e-6)
+
+
+def test_twenty_degrees_off_axis_costs_nothing(lifter: Lifter, people: People) -> None:
+    angle = np.radians(20.0)
+    turn = rotation_onto_axis(np.array([np.sin(angle), 0.0, np.cos(angle)])).T
+    errors = []
+    for move in (np.eye(3), turn):
+        truth = people.joints_mm @ move.T
+        lifted = [lift_one(lifter, observe(pixels)).joints_3d_mm for pixels in project_px(truth)]
+        errors.append(root_centred_error_mm(np.stack(lifted), truth).mean())
+    assert abs(errors[1] - errors[0]) < 2.0
+
+
+def test_a_mirrored_person_gives_about_the_mirrored_pose(lifter: Lifter, people: People) -> None:
+    mirror = list(LSP14.mirror)
+    differences = []
+    for i in range(20):
+        person = lift_one(lifter, people.observation(i)).joints_3d_mm
+        pixels = people.joints_px[i][mirror] * [-1, 1]
+        pixels[:, 0] += 2 * INTRINSICS.principal_point_px[0]
+        mirrored = lift_one(lifter, observe(pixels)).joints_3d_mm[mirror] * [-1, 1, 1]
+        differences.append(root_centred_error_mm(mirrored[None], person[None]).mean())
+    # The library is not symmetric: as good as two different samples of it agree.
+    assert np.median(differences) < 90.0
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("missing", [(4,), (0, 10, 13), (8, 11), (9, 10, 12, 13, 0)])
+def test_missing_joints_are_inferred(
+    lifter: Lifter, people: People, method: Method, missing: tuple[int, ...]
+) -> None:
+    pixels = people.joints_px[7].copy()
+    pixels[list(missing)] = np.nan
+    person = lift_one(lifter, observe(pixels, missing), method=method)
+    assert np.isfinite(person.joints_3d_mm).all()
+    assert np.isfinite(person.warped_mm).all()
+    assert "truncated" in person.warnings
+
+
+def test_a_missing_joint_is_less_sure(lifter: Lifter, people: People) -> None:
+    wrist = 4
+    larger = []
+    for i in range(20):
+        whole = lift_one(lifter, people.observation(i)).sigma_mm
+        hidden = lift_one(lifter, observe(people.joints_px[i], (wrist,))).sigma_mm
+        assert whole is not None
+        assert hidden is not None
+        larger.append(hidden[wrist] > whole[wrist])
+    # Not each time: without the wrist other exemplars are nearest.
+    assert np.mean(larger) > 0.8
+
+
+@pytest.mark.parametrize(
+    ("kept", "reason"),
+    [
+        ((0, 1, 2, 5, 8), "5 joints"),
+        ((3, 4, 6, 7, 9, 10, 12, 13), "fewer than 2"),
+        ((), "0 joints"),
+    ],
+)
+def test_too_few_joints_are_not_guessed(
+    lifter: Lifter, people: People, kept: tuple[int, ...], reason: str
+) -> None:
+    missing = tuple(set(range(14)) - set(kept))
+    (answer,) = lifter.lift([observe(people.joints_px[0], missing)], INTRINSICS)
+    assert isinstance(answer, NotLiftable)
+    assert reason in answer.reason
+
+
+def test_joints_on_one_spot_are_not_lifted(lifter: Lifter) -> None:
+    (answer,) = lifter.lift([observe(np.full((14, 2), 77.0))], INTRINSICS)
+    assert isinstance(answer, NotLiftable)
+
+
+def test_a_joint_far_off_is_set_aside(lifter: Lifter, people: People) -> None:
+    pixels = people.joints_px[1].copy()
+    pixels[10] += [900.0, -900.0]
+    person = lift_one(lifter, observe(pixels))
+    assert "inconsistent_joints" in person.warnings
+    assert "inconsistent_joints" not in lift_one(lifter, people.observation(1)).warnings
+
+
+def test_an_assumed_focal_length_is_said(lifter: Lifter, people: People) -> None:
+    assumed = replace(INTRINSICS, source="assumed")
+    assert "assumed_focal" in lift_one(lifter, people.observation(0), assumed).warnings
+    assert "assumed_focal" not in lift_one(lifter, people.observation(0)).warnings
+
+
+def test_stated_covariance_is_used(lifter: Lifter, people: People) -> None:
+    pixels = people.joints_px[4].copy()
+    pixels[4] += [60.0, 0.0]
+    covariance = np.broadcast_to(np.eye(2), (14, 2, 2)).copy()
+    sure = lift_one(lifter, Observation(pixels, np.ones(14), covariance))
+    covariance[4] = 90.0**2 * np.eye(2)
+    unsure = lift_one(lifter, Observation(pixels, np.ones(14), covariance))
+    truth = project_px(people.joints_mm[4])[4]
+    moved = [np.linalg.norm(project_px(p.joints_3d_mm)[4] - truth) for p in (sure, unsure)]
+    assert moved[1] < moved[0]
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: Observation(np.zeros((13, 2)), np.ones(13)),
+        lambda: Observation(np.zeros((14, 2)), np.full(14, 1.5)),
+        lambda: Observation(np.full((14, 2), np.nan), np.ones(14)),
+        lambda: Observation(np.zeros((14, 2)), np.ones(14), np.zeros((14, 2))),
+    ],
+)
+def test_wrong_observations_are_refused(build: Callable[[], Observation]) -> None:
+    with pytest.raises(ValueError, match=r"must|not finite"):
+        build()
+
+
+def test_lifting_is_pinhole_consistent_at_any_focal(lifter: Lifter, people: People) -> None:
+    for focal_px in (500.0, 3000.0):
+        camera = Intrinsics(focal_px, INTRINSICS.principal_point_px, "exif")
+        person = lift_one(lifter, people.observation(6), camera)
+        back = project(person.warped_mm, focal_px, np.array(camera.principal_point_px))
+        np.testing.assert_allclose(back, people.joints_px[6], atol=1e-9)
