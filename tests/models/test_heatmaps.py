@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models.heatmaps import calibrated, marginals, peak_beliefs, spread, sub_cell_peaks
+
+CELLS = 40
+STRIDE = 4.0
+
+
+def gaussian(x: float, y: float, sigma_x: float, sigma_y: float, rho: float = 0.0) -> np.ndarray:
+    """Log of an (unnormalised) Gaussian on the cell grid, (CELLS, CELLS)."""
+    v, u = np.mgrid[0:CELLS, 0:CELLS]
+    a, b = (u - x) / sigma_x, (v - y) / sigma_y
+    return -(a * a - 2 * rho * a * b + b * b) / (2 * (1 - rho * rho))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    x=st.floats(2, CELLS - 3),
+    y=st.floats(2, CELLS - 3),
+    sigma=st.floats(0.8, 4.0),
+    ratio=st.floats(0.6, 1.6),
+    rho=st.floats(-0.5, 0.5),
+)
+def test_peak_of_a_gaussian_is_found_to_a_tenth_of_an_input_pixel(
+    x: float, y: float, sigma: float, ratio: float, rho: float
+) -> None:
+    maps = gaussian(x, y, sigma, sigma * ratio, rho)[None, None].astype(np.float32)
+    at, _ = sub_cell_peaks(marginals(maps, "logits"))
+    assert np.abs(at[0, 0] - (x, y)).max() * STRIDE < 0.1
+
+
+def test_beliefs_and_logits_give_the_same_place() -> None:
+    log_map = gaussian(17.3, 22.6, 1.5, 2.0)
+    logits, _ = sub_cell_peaks(marginals(log_map[None, None].astype(np.float32), "logits"))
+    beliefs, _ = sub_cell_peaks(
+        marginals(np.exp(log_map)[None, None].astype(np.float32), "beliefs")
+    )
+    np.testing.assert_allclose(logits, beliefs, atol=0.01)
+
+
+def test_marginals_sum_to_one_even_for_extreme_maps() -> None:
+    rng = np.random.default_rng(0)
+    maps = rng.normal(0, 200, (3, 14, 12, 12)).astype(np.float32)
+    np.testing.assert_allclose(marginals(maps, "logits").sum((-1, -2)), 1)
+    np.testing.assert_allclose(marginals(np.zeros_like(maps), "beliefs").sum((-1, -2)), 1)
+
+
+def test_spread_is_the_covariance_less_the_blur_of_the_targets() -> None:
+    sigma_x, sigma_y, rho, blur = 2.5, 1.8, 0.4, 1.2
+    maps = gaussian(20, 20, sigma_x, sigma_y, rho)[None, None].astype(np.float32)
+    p = marginals(maps, "logits")
+    at, _ = sub_cell_peaks(p)
+    cross = rho * sigma_x * sigma_y
+    expected = np.array([[sigma_x**2, cross], [cross, sigma_y**2]]) - blur**2 * np.eye(2)
+    np.testing.assert_allclose(spread(p, at, blur)[0, 0], expected, rtol=0.02, atol=0.02)
+
+
+def test_spread_stays_invertible_for_a_single_sharp_cell() -> None:
+    maps = np.full((1, 1, 16, 16), -50, np.float32)
+    maps[0, 0, 3, 5] = 50
+    p = marginals(maps, "logits")
+    at, _ = sub_cell_peaks(p)
+    np.testing.assert_allclose(at[0, 0], (5, 3))
+    assert np.linalg.eigvalsh(spread(p, at, 1.2)[0, 0]).min() > 0
+
+
+def test_two_far_peaks_show_as_a_wide_spread() -> None:
+    one = np.exp(gaussian(8, 20, 1.5, 1.5))
+    both = one + 0.9 * np.exp(gaussian(30, 20, 1.5, 1.5))
+    maps = np.log(np.stack([one, both])[None] + 1e-9).astype(np.float32)
+    p = marginals(maps, "logits")
+    at, _ = sub_cell_peaks(p)
+    traces = np.trace(spread(p, at, 1.2), axis1=-2, axis2=-1)[0]
+    assert traces[1] > 20 * traces[0]
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (0, CELLS - 1), (CELLS - 1, 0), (CELLS - 1, CELLS - 1)])
+def test_peaks_at_the_border_stay_in_the_map(corner: tuple[int, int]) -> None:
+    maps = gaussian(*corner, 1.5, 1.5)[None, None].astype(np.float32)
+    at, best = sub_cell_peaks(marginals(maps, "logits"))
+    assert np.abs(at[0, 0] - corner).max() <= 0.75
+    assert peak_beliefs(maps, best, "beliefs").shape == (1, 1)
+
+
+def test_confidence_grows_with_its_evidence() -> None:
+    coefficients = np.array([[0.5, 2.0]])
+    stated = calibrated(np.array([[[-3.0]], [[0.0]], [[3.0]]]), coefficients)[:, 0]
+    assert (np.diff(stated) > 0).all()
+    assert ((stated > 0) & (stated < 1)).all()
