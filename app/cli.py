@@ -90,9 +90,7 @@ def serve(
 ) -> None:
     """Build the default library if it is not cached, and serve."""
     given = {"host": host, "port": port}
-    settings = load_settings(
-        overrides={name: value for name, value in given.items() if value is not None}
-    )
+    settings = load_settings(**{name: value for name, value in given.items() if value is not None})
     _build_if_missing(settings)
     configure_logging(settings.log_level)
 
@@ -201,7 +199,10 @@ def build(
             raise typer.BadParameter("a library of your own needs --directory")
         directory = _build_if_missing(settings)
     else:
-        wanted = BuildSettings(name=directory.name, n_poses=poses, seed=seed)
+        try:
+            wanted = BuildSettings(name=directory.name, n_poses=poses, seed=seed)
+        except ValueError as error:
+            raise typer.BadParameter(str(error), param_hint="--directory") from error
         with stage_progress() as report:
             build_library(directory, PosePrior.load(DEFAULT_PRIOR), wanted, report)
     output.print(str(directory), highlight=False, soft_wrap=True)

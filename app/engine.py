@@ -27,7 +27,7 @@ _WARM_UP_RUNS = 3
 
 @dataclass(frozen=True)
 class Engine:
-    """What is served; ``photo_s`` is how long a small photo of one person took at warm-up."""
+    """What is served; ``photo_s`` is about how long a small photo of one person takes."""
 
     library: Library
     card: ModelCard

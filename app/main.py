@@ -22,19 +22,22 @@ from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
 
 from app import schemas
-from app.admission import Admission
 from app.api import exemplars, health, info, lift, metrics, poses, problems
-from app.api.deps import Service, key_digest
+from app.api.deps import Service
 from app.engine import load_engine
 from app.errors import StartupError
-from app.observability import Metrics, RequestContextMiddleware
-from app.quota import Quota
+from app.observability import RequestContextMiddleware
 from app.settings import Settings, load_settings
 from app.version import VERSION
 
 logger = logging.getLogger("posematch")
 
 _HERE = Path(__file__).resolve().parent
+
+_PAGE_POLICY = (
+    "default-src 'none'; connect-src 'self'; img-src data: blob:; style-src 'unsafe-inline'; "
+    "script-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
 
 _DESCRIPTION = """\
 POST a photo, get every person's 2D joints, the matched exemplar, the camera and a 3D skeleton.
@@ -63,20 +66,7 @@ def create_app(
     ``on_startup_failure`` is called on the event loop when model or library cannot be loaded.
     """
     settings = load_settings() if settings is None else settings
-    measures = Metrics()
-    keys = [key_digest(key.get_secret_value()).hex() for key in settings.api_keys]
-    quota = settings.quota_per_minute
-    service = Service(
-        settings=settings,
-        metrics=measures,
-        admission=Admission(
-            workers=settings.workers,
-            queue_size=settings.queue_size,
-            deadline_s=settings.deadline_ms / 1e3,
-        ),
-        quota=None if quota is None else Quota(keys, quota),
-    )
-    measures.watch(service.admission)
+    service = Service(settings)
 
     async def start() -> None:
         try:
@@ -91,7 +81,7 @@ def create_app(
             on_startup_failure(service.startup_error)
             return
         manifest = engine.library.manifest
-        measures.describe(
+        service.metrics.describe(
             version=VERSION,
             model=f"{engine.card.name} {engine.card.version}",
             library=f"{manifest.name} {manifest.version}",
@@ -112,7 +102,7 @@ def create_app(
             if service.engine is not None:
                 service.engine.library.close()
 
-    middleware = [Middleware(RequestContextMiddleware, metrics=measures)]
+    middleware = [Middleware(RequestContextMiddleware, metrics=service.metrics)]
     if settings.cors_origins:
         middleware.append(
             Middleware(
@@ -140,7 +130,7 @@ def create_app(
 
     @app.get("/", include_in_schema=False)
     async def get_page() -> HTMLResponse:
-        return HTMLResponse(page)
+        return HTMLResponse(page, headers={"Content-Security-Policy": _PAGE_POLICY})
 
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

@@ -15,7 +15,7 @@ class Quota:
 
     def __init__(
         self,
-        holders: Iterable[str],
+        holders: Iterable[bytes],
         per_minute: int,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -25,7 +25,7 @@ class Quota:
         now = clock()
         self._buckets = dict.fromkeys(holders, (self._capacity, now))
 
-    def take(self, holder: str) -> int | None:
+    def take(self, holder: bytes) -> int | None:
         """Count one request of ``holder``; None, or the whole seconds until one is allowed."""
         tokens, since = self._buckets[holder]
         now = self._clock()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -65,7 +64,7 @@ class Settings(BaseSettings):
         description="Most pixels of an image, read from its header before anything is decoded.",
     )
     upload_timeout_s: float = Field(
-        20.0, gt=0, le=3600, description="Longest time a body may take to arrive, else 408."
+        30.0, gt=0, le=3600, description="Longest time a body may take to arrive, else 408."
     )
     decode_side_px: int = Field(
         1280,
@@ -158,31 +157,22 @@ class Settings(BaseSettings):
         return self
 
 
-def load_settings(
-    environ: Mapping[str, str] | None = None, overrides: Mapping[str, Any] | None = None
-) -> Settings:
+def load_settings(**overrides: Any) -> Settings:
     """Settings from the environment; ``overrides`` win.
 
     Raises ``StartupError`` naming every unknown POSEMATCH_* variable or every bad value.
     """
-    environ = os.environ if environ is None else environ
     known = {ENV_PREFIX + name.upper() for name in Settings.model_fields}
-    unknown = sorted(key for key in environ if key.upper().startswith(ENV_PREFIX))
-    unknown = [key for key in unknown if key.upper() not in known]
+    given = {key for key in os.environ if key.upper().startswith(ENV_PREFIX)}
+    unknown = sorted(key for key in given if key.upper() not in known)
     if unknown:
         hints = []
         for key in unknown:
             close = difflib.get_close_matches(key.upper(), known, 1)
             hints.append(key + (f" (did you mean {close[0]}?)" if close else ""))
         raise StartupError("unknown settings: " + ", ".join(hints))
-    values = {
-        name: environ[key]
-        for name in Settings.model_fields
-        for key in environ
-        if key.upper() == ENV_PREFIX + name.upper()
-    }
     try:
-        return Settings(**{**values, **(overrides or {})})
+        return Settings(**overrides)
     except ValidationError as error:
         lines = [
             f"{_variable(item['loc'])}: {item['msg'].removeprefix('Value error, ')}"

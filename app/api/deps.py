@@ -26,18 +26,25 @@ class Service:
     """
 
     settings: Settings
-    metrics: Metrics
-    admission: Admission
-    quota: Quota | None
+    metrics: Metrics = field(default_factory=Metrics)
+    admission: Admission = field(init=False)
+    quota: Quota | None = None
     engine: Engine | None = None
     stopping: bool = False
     startup_error: StartupError | None = None
     key_digests: tuple[bytes, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.key_digests = tuple(
-            key_digest(key.get_secret_value()) for key in self.settings.api_keys
+        settings = self.settings
+        self.admission = Admission(
+            workers=settings.workers,
+            queue_size=settings.queue_size,
+            deadline_s=settings.deadline_ms / 1e3,
         )
+        self.metrics.watch(self.admission)
+        self.key_digests = tuple(_digest(key.get_secret_value()) for key in settings.api_keys)
+        if settings.quota_per_minute is not None:
+            self.quota = Quota(self.key_digests, settings.quota_per_minute)
 
 
 def get_service(request: Request) -> Service:
@@ -58,12 +65,12 @@ def authorise(request: Request, service: ServiceDep) -> None:
         return
     scheme, _, token = request.headers.get("authorization", "").partition(" ")
     given = token.strip() if scheme.lower() == "bearer" else request.headers.get("x-api-key", "")
-    digest = key_digest(given)
+    digest = _digest(given)
     matches = [hmac.compare_digest(digest, key) for key in service.key_digests]
     if not any(matches):
         raise UnauthorizedError("give a key as 'Authorization: Bearer KEY' or 'X-API-Key: KEY'")
     if service.quota is not None:
-        retry_after_s = service.quota.take(digest.hex())
+        retry_after_s = service.quota.take(digest)
         if retry_after_s is not None:
             service.metrics.refused.labels("quota").inc()
             raise QuotaExceededError(retry_after_s)
@@ -81,6 +88,6 @@ def get_engine(service: ServiceDep) -> Engine:
 EngineDep = Annotated[Engine, Depends(get_engine)]
 
 
-def key_digest(key: str) -> bytes:
+def _digest(key: str) -> bytes:
     """SHA-256 of an API key: what is kept, compared and counted by."""
     return hashlib.sha256(key.encode("utf-8", "surrogateescape")).digest()

@@ -18,6 +18,7 @@ ACCEPTED_TYPES = ("image/jpeg", "image/png", "image/webp")
 
 _MAX_PIECES = 65_536
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+_JPEG_NOT_FILL = re.compile(rb"[^\xff]")
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
 _ISO_BRANDS = {
     b"heic": "HEIC",
@@ -110,12 +111,11 @@ def _read_jpeg(data: bytes) -> ImageHeader:
     scanned = False
     for _ in range(_MAX_PIECES):
         position = data.find(b"\xff", position)
-        while 0 <= position < len(data) and data[position] == 0xFF:
-            position += 1
-        if not 0 < position < len(data):
+        found = _JPEG_NOT_FILL.search(data, position) if position >= 0 else None
+        if found is None:
             _corrupt(kind, "it is truncated")
-        marker = data[position]
-        position += 1
+        marker = data[found.start()]
+        position = found.end()
         if marker == 0xD9:
             break
         if marker <= 0x01 or 0xD0 <= marker <= 0xD7:

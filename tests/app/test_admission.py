@@ -196,12 +196,12 @@ def test_errors_of_the_work_come_back_and_free_the_permit() -> None:
 
 def test_quota_refills_steadily() -> None:
     now = 0.0
-    quota = Quota(["a", "b"], per_minute=2, clock=lambda: now)
-    assert [quota.take("a") for _ in range(3)] == [None, None, 30]
-    assert quota.take("b") is None
+    quota = Quota([b"a", b"b"], per_minute=2, clock=lambda: now)
+    assert [quota.take(b"a") for _ in range(3)] == [None, None, 30]
+    assert quota.take(b"b") is None
     now = 29.0
-    assert quota.take("a") == 1
+    assert quota.take(b"a") == 1
     now = 30.5
-    assert quota.take("a") is None
+    assert quota.take(b"a") is None
     now = 1e6
-    assert [quota.take("a") for _ in range(3)] == [None, None, 30], "no more than a minute's worth"
+    assert [quota.take(b"a") for _ in range(3)] == [None, None, 30], "no more than a minute's worth"

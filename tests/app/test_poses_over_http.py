@@ -180,6 +180,14 @@ def test_nobody_is_an_answer(server: Server) -> None:
     assert post(server, grey)["people"] == []
 
 
+@pytest.mark.parametrize("size", [(1, 1), (1, 3000), (3000, 1), (5, 7)])
+def test_odd_sizes_are_answered(server: Server, size: tuple[int, int]) -> None:
+    answer = post(server, encode(np.full((*size, 3), 90, np.uint8), ".png"))
+    assert (answer["image"]["height_px"], answer["image"]["width_px"]) == size
+    box = post(server, encode(np.full((*size, 3), 90, np.uint8), ".png"), "box_px=-9,-9,50,90")
+    assert len(box["people"]) == 1
+
+
 def test_batch(server: Server, renders: list[Render]) -> None:
     files = [
         ("image", ("a.jpg", renders[0].data)),

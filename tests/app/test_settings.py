@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -10,16 +11,19 @@ from app.errors import StartupError
 from app.settings import Settings, load_settings
 
 
-def test_values_come_from_the_environment() -> None:
-    settings = load_settings(
-        {
-            "POSEMATCH_PORT": "9000",
-            "POSEMATCH_LIBRARY_DIR": "/srv/library",
-            "POSEMATCH_API_KEYS": "first-key-long-enough, second-key-long-enough",
-            "POSEMATCH_CORS_ORIGINS": "https://a.example,http://localhost:3000",
-            "PATH": "/bin",
-        }
-    )
+@pytest.fixture(autouse=True)
+def _no_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    for key in os.environ:
+        if key.startswith("POSEMATCH_"):
+            monkeypatch.delenv(key)
+
+
+def test_values_come_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("POSEMATCH_PORT", "9000")
+    monkeypatch.setenv("POSEMATCH_LIBRARY_DIR", "/srv/library")
+    monkeypatch.setenv("POSEMATCH_API_KEYS", "first-key-long-enough, second-key-long-enough")
+    monkeypatch.setenv("POSEMATCH_CORS_ORIGINS", "https://a.example,http://localhost:3000")
+    settings = load_settings()
     assert settings.port == 9000
     assert settings.library_dir == Path("/srv/library")
     assert len(settings.api_keys) == 2
@@ -27,13 +31,15 @@ def test_values_come_from_the_environment() -> None:
     assert "first-key" not in repr(settings)
 
 
-def test_overrides_win() -> None:
-    assert load_settings({"POSEMATCH_PORT": "9000"}, {"port": 9001}).port == 9001
+def test_overrides_win(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("POSEMATCH_PORT", "9000")
+    assert load_settings(port=9001).port == 9001
 
 
-def test_unknown_settings_are_refused_with_a_hint() -> None:
+def test_unknown_settings_are_refused_with_a_hint(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("POSEMATCH_PROT", "9000")
     with pytest.raises(StartupError, match=r"POSEMATCH_PROT .did you mean POSEMATCH_PORT\?"):
-        load_settings({"POSEMATCH_PROT": "9000"})
+        load_settings()
 
 
 @pytest.mark.parametrize(
@@ -55,9 +61,10 @@ def test_unknown_settings_are_refused_with_a_hint() -> None:
         ("LOG_LEVEL", "chatty"),
     ],
 )
-def test_nonsense_refuses_to_start(name: str, value: str) -> None:
+def test_nonsense_refuses_to_start(name: str, value: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(f"POSEMATCH_{name}", value)
     with pytest.raises(StartupError):
-        load_settings({f"POSEMATCH_{name}": value})
+        load_settings()
 
 
 def test_every_setting_is_described() -> None:
