@@ -45,8 +45,8 @@ class LiftingSettings:
 
     σ(library) maximises the probability eq. 4 gives to the candidate that is truly nearest in 3D,
     over held-out people at 0, 5 and 10 px of known noise (``evaluation.calibration``); it is wide:
-    the image tells thirty close candidates apart poorly (mean log probability -2.98; -3.40 is
-    chance).
+    the image tells thirty close candidates apart poorly (mean log probability -3.0 to -3.1 for 30
+    to 40 px; -3.40 is chance).
 
     ``shortlist``, ``paper_shortlist``: k of eq. 4 for the two methods; ``neighbours``: ensemble of
     the fusion, ``masked_neighbours`` the same where joints are missing, for that search costs more;
