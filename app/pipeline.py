@@ -28,6 +28,7 @@ from app.lifting.types import (
 )
 from models.heatmaps import Joints2D
 from models.person_detector import PersonBox
+from models.presence import present
 
 Floats = npt.NDArray[np.float64]
 
@@ -208,6 +209,9 @@ class Pipeline:
         boxes = self._boxes(seen, query)
         clock.lap("detect")
         joints = self._estimator.estimate(seen.pixels_bgr, boxes) if boxes else []
+        if query.box_px is None:
+            kept = present(joints)
+            boxes, joints = [boxes[i] for i in kept], [joints[i] for i in kept]
         joints = [_to_image(found, seen) for found in joints]
         clock.lap("pose")
         observations = [
