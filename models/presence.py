@@ -1,4 +1,4 @@
-"""Second thoughts on detections: a box without a readable pose, or a pose already taken, is nobody."""
+"""Second thoughts on detections: a box without a readable pose, or with a taken one, is nobody."""
 
 from __future__ import annotations
 

@@ -13,7 +13,8 @@ def gaussian(x: float, y: float, sigma_x: float, sigma_y: float, rho: float = 0.
     """Log of an (unnormalised) Gaussian on the cell grid, (CELLS, CELLS)."""
     v, u = np.mgrid[0:CELLS, 0:CELLS]
     a, b = (u - x) / sigma_x, (v - y) / sigma_y
-    return -(a * a - 2 * rho * a * b + b * b) / (2 * (1 - rho * rho))
+    log_density: np.ndarray = -(a * a - 2 * rho * a * b + b * b) / (2 * (1 - rho * rho))
+    return log_density
 
 
 @settings(max_examples=60, deadline=None)

@@ -9,7 +9,7 @@ from models.presence import present
 def person(shift_px: float = 0.0, confidence: float = 0.9) -> Joints2D:
     rng = np.random.default_rng(0)
     return Joints2D(
-        positions_px=rng.uniform(0, 100, (14, 2)) + (shift_px, 0),
+        positions_px=rng.uniform(0, 100, (14, 2)) + np.array([shift_px, 0]),
         covariance_px2=np.tile(np.eye(2), (14, 1, 1)),
         confidence=np.full(14, confidence),
         sigma_px=None,
