@@ -33,7 +33,8 @@ class TeacherPerson:
     score: float
 
 
-def _session(path: Path) -> ort.InferenceSession:
+def onnx_session(path: Path) -> ort.InferenceSession:
+    """A single-threaded session on the CPU."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
@@ -58,8 +59,8 @@ class BlazePose:
     """Detector and landmark network of one folder (``blazepose_*.onnx``)."""
 
     def __init__(self, folder: Path, variant: str = "heavy") -> None:
-        self._detector = _session(folder / "blazepose_detector.onnx")
-        self._landmarks = _session(folder / f"blazepose_{variant}.onnx")
+        self._detector = onnx_session(folder / "blazepose_detector.onnx")
+        self._landmarks = onnx_session(folder / f"blazepose_{variant}.onnx")
         self._anchors = _anchors()
 
     def detect(
