@@ -4,7 +4,7 @@
 
 ``--data`` has ``lspet_val.tar`` (human labels) and ``photos_*.tar`` (labels by the heavy reference;
 only the photos that training held out are used); ``--reference`` the networks to compare with, in
-ONNX: ``mobile_cpm.onnx``, ``blazepose_full.onnx``, ``blazepose_heavy.onnx``. Everybody gets the same
+ONNX: ``mobile_cpm.onnx``, ``blazepose_full.onnx``, ``blazepose_heavy.onnx``. All get the same
 axis-aligned square, 1.25 x the joints' extent.
 """
 

@@ -35,6 +35,10 @@ PHOTOS = "web photos of everyday and sport poses, labels by BlazePose heavy and 
 SCENES = "whole street and sport scenes, boxes by the BlazePose detector and landmark network"
 
 
+HALF = ".half"
+PREFIX = "network."
+
+
 class _FromBytes(nn.Module):
     """uint8 (N, H, W, 3) BGR -> the network's last maps."""
 
@@ -74,11 +78,28 @@ def halve_weights(model: onnx.ModelProto) -> None:
         if value.dtype != np.float32 or value.size < 1024:
             continue
         name = initializer.name
-        stored = numpy_helper.from_array(value.astype(np.float16), f"{name}.half")
+        stored = numpy_helper.from_array(value.astype(np.float16), name + HALF)
         initializer.CopyFrom(stored)
         casts.append(helper.make_node("Cast", [stored.name], [name], to=onnx.TensorProto.FLOAT))
     for cast in reversed(casts):
         model.graph.node.insert(0, cast)
+
+
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """The state dict that an exported file was written from (without the batch counters)."""
+    weights: dict[str, Tensor] = {}
+    for initializer in onnx.load(str(path)).graph.initializer:
+        name = initializer.name.removesuffix(HALF)
+        if name.startswith(PREFIX):
+            value = numpy_helper.to_array(initializer).astype(np.float32)
+            weights[name.removeprefix(PREFIX)] = torch.from_numpy(value)
+    # Equal tensors are stored once, and a strided block's two last biases always are equal: they
+    # are added up, so they get the same gradient from the same start.
+    for name in [n for n in weights if n.endswith(".b.1.bias")]:
+        block = name.removesuffix(".b.1.bias")
+        if f"{block}.skip.1.weight" in weights:
+            weights.setdefault(f"{block}.skip.1.bias", weights[name])
+    return weights
 
 
 def write_onnx(network: nn.Module, example: Tensor, path: Path, axes: dict[int, str]) -> str:
@@ -92,6 +113,10 @@ def write_onnx(network: nn.Module, example: Tensor, path: Path, axes: dict[int, 
         dynamic_axes={"image": axes, "maps": {k + (k > 0): f"maps_{v}" for k, v in axes.items()}},
         opset_version=17,
         dynamo=False,
+        # Keeps the parameters apart and by their names, so that training can go on from the file;
+        # onnxruntime folds the normalisations into the convolutions when it loads it.
+        training=torch.onnx.TrainingMode.PRESERVE,
+        do_constant_folding=False,
     )
     model = onnx.load(str(path))
     halve_weights(model)

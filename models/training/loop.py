@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, help="folder of this run; resumed if any"
     )
-    parser.add_argument("--init", type=Path, help="start from this checkpoint's averaged weights")
+    parser.add_argument("--init", type=Path, help="start from this checkpoint or exported ONNX")
     parser.add_argument("--steps", type=int, default=12000)
     parser.add_argument("--minutes", type=float, help="bring the schedule to its end by then")
     parser.add_argument("--batch", type=int, default=64)
@@ -91,6 +91,19 @@ def _average_into(ema: nn.Module, model: nn.Module, decay: float) -> None:
                 a.copy_(b)
 
 
+def _start_from(path: Path, model: nn.Module) -> None:
+    """Load a checkpoint's averaged weights, or those of an exported ONNX file."""
+    if path.suffix == ".onnx":
+        from models.training.export import read_weights
+
+        missing = model.load_state_dict(read_weights(path), strict=False).missing_keys
+        unset = [key for key in missing if not key.endswith("num_batches_tracked")]
+        if unset:
+            raise SystemExit(f"{path} is of another architecture: it lacks {unset[:3]} ...")
+    else:
+        model.load_state_dict(torch.load(path, map_location="cpu", weights_only=True)["ema"])
+
+
 def fit(
     model: Model,
     args: argparse.Namespace,
@@ -111,8 +124,7 @@ def fit(
     args.out.mkdir(parents=True, exist_ok=True)
     model = model.to(args.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     if args.init:
-        initial = torch.load(args.init, map_location=args.device, weights_only=True)
-        model.load_state_dict(initial["ema"])
+        _start_from(args.init, model)
     ema = copy.deepcopy(model).eval()
     optimizers = optim.build(model, args.optimizer, args.lr)
     base_rates = [[g["lr"] for g in o.param_groups] for o in optimizers]
