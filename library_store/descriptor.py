@@ -70,11 +70,27 @@ def describe(points: ArrayLike) -> NDArray[np.float32]:
 def weighted_distance(query: ArrayLike, weights: ArrayLike, poses: ArrayLike) -> Float:
     """Exact distance D of a query to poses, both normalised on the query's weights.
 
-    ``query``: (14, 2), any unit; ``weights``: (14,) in [0, 1]; ``poses``: (n, 14, 2), any unit.
-    Returns (n,) float64. Raises ``ValueError`` as :func:`normalise` does.
+    ``query``: (14, 2), any unit; ``weights``: (14,) in [0, 1]; ``poses``: (n, 14, 2), any unit,
+    finite. Returns (n,) float64. Raises ``ValueError`` as :func:`normalise` does.
     """
     share = np.asarray(weights, dtype=np.float64)
-    difference = normalise(query, share) - normalise(poses, np.broadcast_to(share, (1, N_JOINTS)))
-    squared = (difference**2).sum(axis=-1) @ share / share.sum()
-    distance: Float = np.sqrt(N_JOINTS * squared)
+    return distance_from_normalised(normalise(query, share), share, poses)
+
+
+def distance_from_normalised(query: Float, weights: Float, poses: ArrayLike) -> Float:
+    """:func:`weighted_distance` of a query already normalised on its weights."""
+    share = np.repeat(weights / weights.sum(), 2)
+    centred = np.array(poses, dtype=np.float64).reshape(-1, N_JOINTS, 2)
+    centred -= (centred.reshape(-1, DIMENSIONS) @ (share[:, None] * _AXIS_OF))[:, None]
+    flat = centred.reshape(-1, DIMENSIONS)
+    radius = np.sqrt(flat**2 @ share)
+    if not np.all(radius > 0):
+        raise ValueError("a pose needs at least two distinct joints of positive weight")
+    flat /= radius[:, None]
+    flat -= np.where(share > 0, query.ravel(), 0.0)
+    distance: Float = np.sqrt(N_JOINTS * (flat**2 @ share))
     return distance
+
+
+_AXIS_OF = np.tile(np.eye(2), (N_JOINTS, 1))
+"""(28, 2): which numbers of a flattened pose are x, which y."""

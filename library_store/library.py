@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from library_store import cameras as camera_geometry
-from library_store.descriptor import describe
+from library_store.descriptor import DIMENSIONS, describe
 from library_store.errors import LibraryError
 from library_store.index import ExactIndex, HnswIndex, Index
 from library_store.manifest import MEND, Manifest, check_files, read_manifest
@@ -103,7 +103,7 @@ class Library:
             self._index = ExactIndex(self._descriptors)
         else:
             self._index = HnswIndex.load(directory / INDEX_FILE, self._descriptors)
-        self._masked = MaskedSearch(self._index, self._descriptors)
+        self._masked = MaskedSearch(self._descriptors)
 
     def _check_shapes(self) -> None:
         counts = self.manifest
@@ -207,7 +207,7 @@ class Library:
         self._poses = self._frames = self._cameras = self._projections = empty
         self._descriptors = empty
         self._index = ExactIndex(empty)
-        self._masked = MaskedSearch(self._index, empty)
+        self._masked = MaskedSearch(empty.reshape(0, DIMENSIONS))
 
     def _group_and_frame(self, pose: int) -> tuple[SourceGroup, int]:
         group = self._groups[bisect_right(self._first_poses, pose) - 1]

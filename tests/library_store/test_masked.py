@@ -5,7 +5,6 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from library_store.descriptor import normalise, weighted_distance
-from library_store.index import HnswIndex, HnswSettings
 from library_store.library import Library
 from library_store.masked import MaskedSearch, MaskedSettings
 from library_store.skeleton import (
@@ -34,9 +33,9 @@ def table(small: Library) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def search(table: np.ndarray) -> MaskedSearch:
-    """A search that never falls back on brute force, with few pilots for this small library."""
-    index = HnswIndex.build(table, HnswSettings(threads=2))
-    return MaskedSearch(index, table, MaskedSettings(n_pilots=400, entries_per_guess=0))
+    """A search that scans little of this small library, whose neighbours are far apart."""
+    settings = MaskedSettings(rows_per_cell=20, share=0.2, share_per_joint=0.05, least_scanned=0)
+    return MaskedSearch(table, settings)
 
 
 def noisy_queries(table: np.ndarray, n: int) -> np.ndarray:
