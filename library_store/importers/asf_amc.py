@@ -1,0 +1,258 @@
+"""CMU's own pair of files: ASF (a skeleton with its rest pose) and AMC (one clip of its motion).
+
+A bone of the ASF has a direction and length at rest, and an ``axis``: Euler angles of the local
+frame C in which the AMC's angles are given. With M the product of a bone's motion rotations, its
+rotation in the world is W_child = W_parent C M C⁻¹, and its end is the parent's end plus
+W direction · length. ``axis a b c XYZ`` is C = Rz(c) Ry(b) Rx(a), and so is M for ``dof rx ry rz``.
+
+Lengths are in inches divided by the file's ``length`` unit, so 25.4 / 0.45 mm each for CMU. Joints
+are ends of bones: the neck is the end of ``lowerneck``, the wrist that of ``lwrist`` (``lradius``
+ends in the forearm, two thirds of the way from elbow to wrist). The bone ``head`` ends inside the
+skull: the head top is 1.6 of its length from its start, as in the prior's data. Y is up.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from library_store.importers.checks import checked
+from library_store.importers.clip import Clip, Float, Frames, MocapError
+from library_store.importers.rotation import euler
+from library_store.skeleton import HEAD_TOP
+
+MM_PER_INCH = 25.4
+CMU_LICENCE = (
+    "CMU Graphics Lab mocap database (mocap.cs.cmu.edu), free for all uses; "
+    "funded by NSF EIA-0196217"
+)
+
+JOINTS: tuple[str, ...] = (
+    "head",
+    "lowerneck",
+    "rclavicle",
+    "rhumerus",
+    "rwrist",
+    "lclavicle",
+    "lhumerus",
+    "lwrist",
+    "rhipjoint",
+    "rfemur",
+    "rtibia",
+    "lhipjoint",
+    "lfemur",
+    "ltibia",
+)
+"""The bone whose end is the joint, in lsp14 order; the head top is beyond that of ``head``."""
+
+HEAD_STRETCH = 1.6
+"""Start of the bone ``head`` to the top of the head, over the bone's length."""
+
+SUBJECTS_60_HZ = frozenset((33, 34, 42, 60, 61, 62, 74, 75, 77, 79, 80, 87, 88, 89))
+"""CMU subjects recorded at 60 Hz; the others are at 120 Hz. (One clip of 136 is at 60 Hz.)"""
+
+INDEX_FILE = "cmu_index.csv"
+"""Looked for beside the clip and in the three folders above: actions and frame rates by clip."""
+
+_NO_BONE = "root"
+
+
+@dataclass(frozen=True)
+class Bone:
+    """A bone at rest: ``offset`` (3,) from its parent's end to its own, in the file's units."""
+
+    parent: str
+    offset: Float
+    frame: Float
+    dof: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class SkeletonFile:
+    """An ASF: bones by name, parents before children, and how the root moves."""
+
+    bones: dict[str, Bone]
+    root_order: tuple[str, ...]
+    root_axes: str
+    root_frame: Float
+    mm_per_unit: float
+
+
+def read(path: Path, *, skeleton: Path | None = None) -> Clip:
+    """The clip of an AMC file; ``skeleton`` is its ASF, by default the one in the same folder."""
+    asf = read_asf(skeleton or find_skeleton(path))
+    frames, motion = read_amc(path, asf)
+    ends = bone_ends(asf, motion)
+    missing = [name for name in JOINTS if name not in ends]
+    if missing:
+        raise MocapError(path, f"the skeleton has no bones {', '.join(missing)}")
+    joints = np.stack([ends[name] for name in JOINTS], axis=1)
+    start = ends[asf.bones["head"].parent]
+    joints[:, HEAD_TOP] = start + HEAD_STRETCH * (joints[:, HEAD_TOP] - start)
+    subject, action, rate, findings = describe_cmu(path)
+    clip = Clip(
+        name=path.stem,
+        subject=subject,
+        action=action,
+        frame_rate_hz=rate,
+        positions_mm=(joints * asf.mm_per_unit).astype(np.float32),
+        frames=frames,
+        findings=findings,
+        licence=CMU_LICENCE if subject else "",
+    )
+    return checked(path, clip, up_is_known=True, bones_are_known=True)
+
+
+def find_skeleton(path: Path) -> Path:
+    """The ASF of an AMC: the one its name begins with, or the only one in the folder."""
+    here = sorted(p for p in path.parent.iterdir() if p.suffix.lower() == ".asf")
+    named = [p for p in here if path.stem.startswith(p.stem)]
+    if len(named) != 1 and len(here) != 1:
+        found = ", ".join(p.name for p in here) or "none"
+        raise MocapError(path, f"its ASF skeleton must lie in the same folder; found: {found}")
+    return named[0] if len(named) == 1 else here[0]
+
+
+def describe_cmu(path: Path) -> tuple[str, str, float, tuple[str, ...]]:
+    """Subject, action, frame rate and findings of a clip named as CMU's are, ``<subject>_<n>``.
+
+    Neither AMC files nor CMU's conversions to BVH can be trusted on the rate, so it comes from the
+    index file if there is one, else from the list of subjects at 60 Hz.
+    """
+    subject, _, rest = path.stem.partition("_")
+    number = rest.split("-")[0]
+    if not (subject.isdigit() and number.isdigit()):
+        finding = "the file does not say its frame rate and its name is not CMU's: 120 Hz assumed"
+        return "", "", 120.0, (finding,)
+    for folder in list(path.resolve().parents)[:4]:
+        row = _index_row(folder / INDEX_FILE, int(subject), int(number))
+        if row is not None:
+            return f"cmu_{subject}", row[0], row[1], ()
+    rate = 60.0 if int(subject) in SUBJECTS_60_HZ else 120.0
+    finding = f"frame rate {rate:.0f} Hz from the list of CMU subjects"
+    return f"cmu_{subject}", "", rate, (finding,)
+
+
+def _index_row(index: Path, subject: int, number: int) -> tuple[str, float] | None:
+    if not index.is_file():
+        return None
+    with index.open(encoding="utf-8", errors="replace", newline="") as lines:
+        for row in csv.reader(lines):
+            if row[:2] == [str(subject), str(number)] and len(row) > 3:
+                try:
+                    return row[2], float(row[3])
+                except ValueError:
+                    return None
+    return None
+
+
+def read_asf(path: Path) -> SkeletonFile:
+    """Parse an ASF file; ``MocapError`` says what is missing."""
+    try:
+        sections = _sections(path.read_text(encoding="latin-1"))
+        units = {words[0]: words[1] for words in sections["units"]}
+        if units.get("angle", "deg") != "deg":
+            raise MocapError(path, "angles in radians are not supported; CMU's files use degrees")
+        root = {words[0]: words[1:] for words in sections["root"]}
+        parents = {child: words[0] for words in sections["hierarchy"] for child in words[1:]}
+        at_rest = {bone["name"][0]: bone for bone in _blocks(sections["bonedata"])}
+        bones = {name: _bone(at_rest[name], parent) for name, parent in parents.items()}
+        orientation = np.array([float(v) for v in root["orientation"]])
+        axes = root["axis"][0].lower()
+        return SkeletonFile(
+            bones=bones,
+            root_order=tuple(word.lower() for word in root["order"]),
+            root_axes=axes,
+            root_frame=euler(axes[::-1], orientation[::-1]),
+            mm_per_unit=MM_PER_INCH / float(units["length"]),
+        )
+    except (KeyError, IndexError, ValueError) as error:
+        raise MocapError(path, f"not a whole ASF skeleton ({error!r})") from error
+
+
+def _bone(block: dict[str, list[str]], parent: str) -> Bone:
+    direction = np.array([float(v) for v in block["direction"][:3]])
+    *angles, axes = block["axis"]
+    axes = axes.lower()
+    return Bone(
+        parent=parent,
+        offset=direction * float(block["length"][0]),
+        frame=euler(axes[::-1], np.array([float(v) for v in angles])[::-1]),
+        dof=tuple(word.lower() for word in block.get("dof", ())),
+    )
+
+
+def _sections(text: str) -> dict[str, list[list[str]]]:
+    sections: dict[str, list[list[str]]] = {}
+    current: list[list[str]] = []
+    for line in text.splitlines():
+        words = line.split("#")[0].split()
+        if words and words[0].startswith(":"):
+            current = sections.setdefault(words[0][1:].lower(), [])
+        elif words and words != ["begin"]:
+            current.append(words)
+    for name in ("hierarchy", "root", "units"):
+        sections[name] = [words for words in sections[name] if words != ["end"]]
+    return sections
+
+
+def _blocks(lines: list[list[str]]) -> list[dict[str, list[str]]]:
+    blocks: list[dict[str, list[str]]] = [{}]
+    for words in lines:
+        if words == ["end"]:
+            blocks.append({})
+        else:
+            blocks[-1][words[0]] = words[1:]
+    return [block for block in blocks if block]
+
+
+def read_amc(path: Path, asf: SkeletonFile) -> tuple[Frames, dict[str, Float]]:
+    """Frame numbers (F,) and, by bone, values (F, n) in the order of its degrees of freedom."""
+    widths = {name: len(bone.dof) for name, bone in asf.bones.items() if bone.dof}
+    widths[_NO_BONE] = len(asf.root_order)
+    frames: list[int] = []
+    values: dict[str, list[list[float]]] = {name: [] for name in widths}
+    for number, line in enumerate(path.read_text(encoding="latin-1").splitlines(), 1):
+        words = line.split()
+        if not words or line.startswith(("#", ":")):
+            continue
+        try:
+            if len(words) == 1:
+                frames.append(int(words[0]))
+            elif len(words) - 1 != widths[words[0]] or not frames:
+                raise ValueError(f"{widths[words[0]]} values expected")
+            else:
+                values[words[0]].append([float(word) for word in words[1:]])
+        except (ValueError, KeyError) as error:
+            raise MocapError(path, f"line {number}: {line.strip()!r}: {error!r}") from error
+    short = [name for name, rows in values.items() if len(rows) != len(frames)]
+    if not frames or short:
+        raise MocapError(path, f"{len(frames)} frames, not all with values for {short or 'a bone'}")
+    motion = {name: np.array(rows, dtype=np.float64) for name, rows in values.items()}
+    if not all(math.isfinite(float(rows.sum())) for rows in motion.values()):
+        raise MocapError(path, "has values that are not finite")
+    return np.array(frames, dtype=np.int64), motion
+
+
+def bone_ends(asf: SkeletonFile, motion: dict[str, Float]) -> dict[str, Float]:
+    """Ends of all bones (F, 3) in the world, in the file's units."""
+    root = motion[_NO_BONE]
+    columns = {name: root[:, i] for i, name in enumerate(asf.root_order)}
+    place = np.stack([columns[name] for name in ("tx", "ty", "tz")], axis=-1)
+    turns = [f"r{axis}" for axis in asf.root_axes]
+    angles = np.stack([columns[name] for name in reversed(turns)], axis=-1)
+    turned = asf.root_frame @ euler(asf.root_axes[::-1], angles) @ asf.root_frame.T
+    ends, world = {_NO_BONE: place}, {_NO_BONE: turned}
+    for name, bone in asf.bones.items():
+        spin = world[bone.parent]
+        if bone.dof:
+            axes = "".join(dof[1] for dof in reversed(bone.dof))
+            local = euler(axes, motion[name][:, ::-1])
+            spin = spin @ bone.frame @ local @ bone.frame.T
+        world[name] = spin
+        ends[name] = ends[bone.parent] + spin @ bone.offset
+    return ends

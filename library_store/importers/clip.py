@@ -1,0 +1,56 @@
+"""What every importer yields: a clip of 14-joint poses, and the error for a file it cannot read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from library_store.errors import LibraryError
+from library_store.skeleton import LSP14
+
+Float = NDArray[np.float64]
+Frames = NDArray[np.int64]
+
+
+class MocapError(LibraryError):
+    """A motion capture file cannot be imported; the message names the file and what is wrong."""
+
+    def __init__(self, path: Path, problem: str) -> None:
+        super().__init__(f"{path}: {problem}")
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One recording of one person, on the lsp14 skeleton.
+
+    name: the clip's name, from the file's name or the file.
+    subject: who it shows; empty if the file does not say.
+    action: what the person does; empty if the file does not say.
+    frame_rate_hz: frames a second; NaN if the file does not say.
+    positions_mm: (F, 14, 3) float32, world frame with Y up, mm. Not root-centred.
+    frames: (F,) int64, the frames' numbers in the file.
+    findings: what the importer noticed, mended or assumed, one sentence each.
+    licence: the licence of the data as far as the file states it, else empty.
+    """
+
+    name: str
+    subject: str
+    action: str
+    frame_rate_hz: float
+    positions_mm: NDArray[np.float32]
+    frames: Frames
+    findings: tuple[str, ...] = ()
+    licence: str = ""
+
+    def __post_init__(self) -> None:
+        if self.positions_mm.shape != (len(self.frames), LSP14.n_joints, 3):
+            raise ValueError(
+                f"clip {self.name!r}: {self.positions_mm.shape} positions, "
+                f"{len(self.frames)} frames"
+            )
+
+    def __len__(self) -> int:
+        return len(self.frames)

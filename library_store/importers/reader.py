@@ -1,0 +1,58 @@
+"""Any motion capture file in, clips out: the importer is chosen by the file's suffix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+from library_store.importers import asf_amc, bvh
+from library_store.importers.clip import Clip, MocapError
+
+SUFFIXES = (".amc", ".bvh")
+
+
+def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
+    """The clips of one file; ``mapping`` is a JSON joint table for BVH files of other names.
+
+    Raises ``MocapError`` for a file that is missing, malformed or of a person no unit fits; nothing
+    of such a file is returned.
+    """
+    importers: dict[str, Callable[[], list[Clip]]] = {
+        ".amc": lambda: [asf_amc.read(path)],
+        ".bvh": lambda: [bvh.read(path, mapping=mapping)],
+    }
+    importer = importers.get(path.suffix.lower())
+    if importer is None:
+        raise MocapError(path, f"not a kind of file that can be imported: {', '.join(SUFFIXES)}")
+    try:
+        return importer()
+    except OSError as error:
+        raise MocapError(path, f"cannot be read: {error.strerror}") from error
+
+
+def find_files(paths: Iterable[Path]) -> Iterator[Path]:
+    """The files given, and those below the folders given that an importer would take, in order."""
+    for path in paths:
+        if path.is_dir():
+            yield from sorted(p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES)
+        else:
+            yield path
+
+
+def read_all(
+    paths: Iterable[Path], *, mapping: Path | None = None, strict: bool = False
+) -> tuple[list[Clip], list[MocapError]]:
+    """The clips of all files and folders, and one error for each file that was skipped.
+
+    With ``strict`` the first such error is raised instead.
+    """
+    clips: list[Clip] = []
+    skipped: list[MocapError] = []
+    for path in find_files(paths):
+        try:
+            clips += read(path, mapping=mapping)
+        except MocapError as error:
+            if strict:
+                raise
+            skipped.append(error)
+    return clips, skipped

@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from library_store.anatomy import LENGTHS, measure_lengths
+from library_store.importers import MocapError, read
+from library_store.importers.asf_amc import bone_ends, read_asf
+from tests.library_store.importers.files import ASF, amc, walk
+
+MM = 25.4 / 0.45
+
+
+@pytest.fixture
+def clip_file(tmp_path: Path) -> Path:
+    (tmp_path / "02.asf").write_text(ASF)
+    path = tmp_path / "02_01.amc"
+    path.write_text(amc(walk()))
+    return path
+
+
+def test_bones_have_the_lengths_of_the_skeleton(clip_file: Path) -> None:
+    (clip,) = read(clip_file)
+    usual = dict(zip(LENGTHS, measure_lengths(clip.positions_mm.astype(float)).T, strict=True))
+    assert_allclose(usual["thigh"], 0.5 * (7.59371 + 7.58734) * MM, atol=0.01)
+    assert_allclose(usual["shank"], 0.5 * (7.28717 + 7.21538) * MM, atol=0.01)
+    # Elbow to the end of the wrist bone, which is in line with the radius.
+    assert_allclose(usual["forearm"], 1.5 * 0.5 * (3.35554 + 3.36431) * MM, atol=0.01)
+    assert usual["trunk"].mean() == pytest.approx(540, abs=40)
+    assert usual["head"].mean() == pytest.approx(235, abs=15)
+
+
+def test_at_rest_directions_are_those_of_the_file(clip_file: Path) -> None:
+    asf = read_asf(clip_file.with_name("02.asf"))
+    rest = {name: np.zeros((1, len(b.dof))) for name, b in asf.bones.items()}
+    ends = bone_ends(asf, rest | {"root": np.zeros((1, 6))})
+    assert_allclose(ends["ltibia"] - ends["lfemur"], [np.array([0.34202, -0.939693, 0]) * 7.28717])
+    assert_allclose(ends["root"], 0.0)
+
+
+def test_a_root_turned_about_y_turns_the_person(clip_file: Path) -> None:
+    asf = read_asf(clip_file.with_name("02.asf"))
+    rest = {name: np.zeros((1, len(b.dof))) for name, b in asf.bones.items()}
+    turned = bone_ends(asf, rest | {"root": np.array([[0, 0, 0, 0, 90.0, 0]])})
+    still = bone_ends(asf, rest | {"root": np.zeros((1, 6))})
+    # Anticlockwise about +Y: x goes to -z.
+    assert_allclose(turned["lhumerus"][:, 2], -still["lhumerus"][:, 0], atol=1e-9)
+
+
+def test_the_knee_bends_about_its_own_axis(clip_file: Path) -> None:
+    asf = read_asf(clip_file.with_name("02.asf"))
+    rest = {name: np.zeros((1, len(b.dof))) for name, b in asf.bones.items()}
+    bent = bone_ends(asf, rest | {"root": np.zeros((1, 6)), "ltibia": np.array([[90.0]])})
+    # A positive rx of a tibia is flexion: the shank points backwards, away from +Z.
+    assert_allclose((bent["ltibia"] - bent["lfemur"])[0], [0, 0, -7.28717], atol=1e-5)
+
+
+def test_where_it_comes_from_is_kept(clip_file: Path) -> None:
+    (clip,) = read(clip_file)
+    assert (clip.name, clip.subject, clip.frame_rate_hz) == ("02_01", "cmu_02", 120.0)
+    assert_allclose(clip.frames, np.arange(1, 13))
+    assert "free for all uses" in clip.licence
+    assert clip.positions_mm.dtype == np.float32
+
+
+def test_subjects_recorded_at_60_hz(clip_file: Path) -> None:
+    (clip,) = read(clip_file.rename(clip_file.with_name("60_08.amc")))
+    assert clip.frame_rate_hz == 60.0
+    assert clip.findings == ("frame rate 60 Hz from the list of CMU subjects",)
+
+
+def test_the_index_names_the_action(clip_file: Path) -> None:
+    header = '"Subject","Trial #","Motion Description","framerate"\n'
+    (clip_file.parent / "cmu_index.csv").write_text(header + '2,1,"walk, then stop",60,343\n')
+    (clip,) = read(clip_file)
+    assert (clip.action, clip.frame_rate_hz, clip.findings) == ("walk, then stop", 60.0, ())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("ltibia", "lshin", "lshin"),
+        ("rfemur ", "rfemur 1.0 ", "rfemur"),
+        ("rfemur ", "rfemur x", "rfemur"),
+        ("lowerback ", "# lowerback ", "lowerback"),
+    ],
+)
+def test_a_malformed_clip_is_refused(clip_file: Path, old: str, new: str, named: str) -> None:
+    clip_file.write_text(clip_file.read_text().replace(old, new, 1))
+    with pytest.raises(MocapError, match=named) as caught:
+        read(clip_file)
+    assert str(clip_file) in str(caught.value)
+
+
+def test_a_cut_clip_is_refused(clip_file: Path) -> None:
+    lines = clip_file.read_text().splitlines()
+    clip_file.write_text("\n".join(lines[:-3]))
+    with pytest.raises(MocapError, match="12 frames"):
+        read(clip_file)
+    clip_file.write_text("\n".join(lines)[:-60])
+    with pytest.raises(MocapError, match=str(clip_file)):
+        read(clip_file)
+
+
+def test_a_skeleton_without_a_bone_is_refused(clip_file: Path) -> None:
+    asf = clip_file.with_name("02.asf")
+    asf.write_text(ASF.replace("name rwrist", "name rpaw"))
+    with pytest.raises(MocapError, match="rwrist"):
+        read(clip_file)
+    asf.unlink()
+    with pytest.raises(MocapError, match=r"ASF skeleton.*found: none"):
+        read(clip_file)
