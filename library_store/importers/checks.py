@@ -116,7 +116,7 @@ def checked(
         clip,
         positions_mm=positions.astype(np.float32),
         frames=frames,
-        findings=tuple(findings),
+        findings=tuple(dict.fromkeys(findings)),  # those of an earlier import only once
     )
 
 
@@ -145,7 +145,8 @@ def find_glitches(positions_mm: Float, frames: Frames, frame_rate_hz: float) -> 
     usual = np.median(bones, axis=0)
     glitch = (np.abs(bones - usual) > BONE_TOLERANCE * usual).any(axis=1)
     if len(frames) > 2 and np.isfinite(frame_rate_hz):
-        seconds = np.maximum(np.abs(np.diff(frames)), 1) / frame_rate_hz
+        gaps = np.maximum(np.abs(np.diff(frames)), 1)
+        seconds = gaps / np.median(gaps) / frame_rate_hz
         step = np.diff(positions_mm - root_of(positions_mm)[:, None], axis=0)
         speed = np.linalg.norm(step, axis=-1) / seconds[:, None]
         fast = speed > MAX_SPEED_MM_S

@@ -29,9 +29,9 @@ class Clip:
     name: the clip's name, from the file's name or the file.
     subject: who it shows; empty if the file does not say.
     action: what the person does; empty if the file does not say.
-    frame_rate_hz: frames a second; NaN if the file does not say.
+    frame_rate_hz: poses a second, gaps aside; NaN if the file does not say.
     positions_mm: (F, 14, 3) float32, world frame with Y up, mm. Not root-centred.
-    frames: (F,) int64, the frames' numbers in the file.
+    frames: (F,) int64, the frames' numbers in the file, which may be of every n-th frame.
     findings: what the importer noticed, mended or assumed, one sentence each.
     licence: the licence of the data as far as the file states it, else empty.
     """

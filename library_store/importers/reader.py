@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from library_store.importers import asf_amc, bvh
+from library_store.importers import asf_amc, bvh, npz
 from library_store.importers.clip import Clip, MocapError
 
-SUFFIXES = (".amc", ".bvh")
+SUFFIXES = (".amc", ".bvh", ".npz")
 
 
 def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
@@ -20,6 +20,7 @@ def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
     importers: dict[str, Callable[[], list[Clip]]] = {
         ".amc": lambda: [asf_amc.read(path)],
         ".bvh": lambda: [bvh.read(path, mapping=mapping)],
+        ".npz": lambda: npz.read(path),
     }
     importer = importers.get(path.suffix.lower())
     if importer is None:

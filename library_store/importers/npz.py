@@ -1,0 +1,226 @@
+"""npz files: our own generic form, Human3.6M and HumanEva as commonly packed, SMPL joints.
+
+*Generic*: ``positions`` (N, 14, 3) on lsp14, or with ``joint_names`` in another order; optional
+``clip`` (N,), ``frame`` (N,), ``clip_name``, ``clip_subject``, ``clip_action``, ``clip_fps`` (one
+a clip), ``up_axis`` and ``license``. What ``write`` makes.
+
+*Human3.6M* ``data_3d_h36m.npz``: ``positions_3d``, an object array that holds subject → action →
+(F, 32 or 17, 3) in metres, Z up, 50 Hz. The neck is H36M's thorax, where the shoulders meet.
+
+*HumanEva* ``data_3d_humaneva15.npz``: the same with 15 joints, 60 Hz.
+
+*SMPL*: ``joints`` (F, 22 or more, 3) in metres, Z up as AMASS has it, in the order of SMPL's body
+joints. SMPL has no top of the head: it is put beyond the neck, towards SMPL's head joint (the
+skull's base), at 0.47 of the trunk's length, the median of CMU's people. AMASS's own files hold
+angles, not joints, and need the licensed body model first.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from library_store.anatomy import root_of, unit
+from library_store.importers.checks import checked
+from library_store.importers.clip import Clip, Float, Frames, MocapError
+from library_store.importers.safe_npz import NpzFile
+from library_store.skeleton import HEAD_TOP, LSP14, NECK
+
+H36M_32 = (15, 13, 25, 26, 27, 17, 18, 19, 1, 2, 3, 6, 7, 8)
+H36M_17 = (10, 8, 14, 15, 16, 11, 12, 13, 1, 2, 3, 4, 5, 6)
+HUMANEVA_15 = (14, 1, 5, 6, 7, 2, 3, 4, 11, 12, 13, 8, 9, 10)
+SMPL = (15, 12, 17, 19, 21, 16, 18, 20, 2, 5, 8, 1, 4, 7)
+"""Index of each lsp14 joint in the other skeletons."""
+
+H36M_HZ, HUMANEVA_HZ = 50.0, 60.0
+HEAD_PER_TRUNK = 0.47
+_MM_PER_M = 1000.0
+
+_CLIP_COLUMNS = ("name", "subject", "action", "fps", "findings", "license")
+_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
+
+_NESTED = {
+    32: ("Human3.6M", H36M_32, H36M_HZ, "Human3.6M licence: academic use only"),
+    17: ("Human3.6M", H36M_17, H36M_HZ, "Human3.6M licence: academic use only"),
+    15: ("HumanEva", HUMANEVA_15, HUMANEVA_HZ, "HumanEva licence: research use only"),
+}
+
+
+def read(path: Path) -> list[Clip]:
+    """All clips of an npz file; the form is told from its arrays' names."""
+    npz = NpzFile(path)
+    if "positions_3d" in npz:
+        return _read_nested(path, npz)
+    if "positions" in npz:
+        return _read_generic(path, npz)
+    if "joints" in npz:
+        return [_read_smpl(path, npz)]
+    if "poses" in npz and "betas" in npz:
+        raise MocapError(
+            path,
+            "holds AMASS body parameters; export the joints with the SMPL body model first, as "
+            "an array 'joints' (F, 22, 3) in metres",
+        )
+    raise MocapError(
+        path,
+        f"has arrays {', '.join(sorted(npz.names)) or 'none'}; wanted is 'positions' (N, 14, 3), "
+        "'positions_3d' (Human3.6M) or 'joints' (SMPL)",
+    )
+
+
+def write(path: Path, clips: Sequence[Clip]) -> None:
+    """Write clips as one generic npz file, mm and Y up; ``read`` yields them again.
+
+    The file appears whole or not at all. Raises ``MocapError`` where it cannot be written.
+    """
+    if not clips:
+        raise MocapError(path, "there are no clips to write")
+    lengths = [len(clip) for clip in clips]
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with unfinished.open("wb") as stream:
+            np.savez_compressed(
+                stream,
+                positions=np.concatenate([clip.positions_mm for clip in clips]),
+                clip=np.repeat(np.arange(len(clips), dtype=np.int32), lengths),
+                frame=np.concatenate([clip.frames for clip in clips]),
+                joint_names=np.array(LSP14.joint_names),
+                units=np.array("mm"),
+                up_axis=np.array("Y"),
+                license=np.array("; ".join(sorted({clip.licence for clip in clips} - {""}))),
+                clip_name=np.array([clip.name for clip in clips]),
+                clip_subject=np.array([clip.subject for clip in clips]),
+                clip_action=np.array([clip.action for clip in clips]),
+                clip_fps=np.array([clip.frame_rate_hz for clip in clips]),
+                clip_license=np.array([clip.licence for clip in clips]),
+                clip_findings=np.array(["\n".join(clip.findings) for clip in clips]),
+            )
+        unfinished.replace(path)
+    except OSError as error:
+        raise MocapError(path, f"cannot be written: {error.strerror}") from error
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _read_generic(path: Path, npz: NpzFile) -> list[Clip]:
+    positions = _numbers(path, "positions", npz["positions"])
+    n = len(positions)
+    if positions.shape != (n, LSP14.n_joints, 3) or n == 0:
+        raise MocapError(path, f"positions are {positions.shape}; wanted is (N, 14, 3)")
+    if "joint_names" in npz:
+        names = npz.column("joint_names")
+        if sorted(names) != sorted(LSP14.joint_names):
+            wanted = ", ".join(LSP14.joint_names)
+            raise MocapError(path, f"joints are {', '.join(names)}; wanted are {wanted}")
+        positions = positions[:, [names.index(name) for name in LSP14.joint_names]]
+    number = _column(path, npz, "clip", n, np.zeros(n, dtype=np.int64))
+    frame = _column(path, npz, "frame", n, np.arange(n))
+    up_axis = npz.text("up_axis").upper()
+    positions, up_is_known = _with_y_up(path, positions, up_axis)
+    columns = {name: npz.column(f"clip_{name}") for name in _CLIP_COLUMNS}
+    if number.min() < 0 or any(c and len(c) <= number.max() for c in columns.values()):
+        raise MocapError(path, f"clip numbers {number.min()} to {number.max()} are not all named")
+    clips = []
+    for i in np.unique(number):
+        own = number == i
+        said = {name: column[i] if column else "" for name, column in columns.items()}
+        try:
+            rate_hz = float(said["fps"] or "nan")
+        except ValueError as error:
+            raise MocapError(path, f"clip_fps {said['fps']!r} is not a number") from error
+        unnamed = path.stem if number.max() == 0 else f"{path.stem}_{i}"
+        clip = Clip(
+            name=said["name"] or unnamed,
+            subject=said["subject"],
+            action=said["action"],
+            frame_rate_hz=rate_hz,
+            positions_mm=positions[own].astype(np.float32),
+            frames=frame[own],
+            findings=tuple(said["findings"].splitlines()),
+            licence=said["license"] or npz.text("license"),
+        )
+        clips.append(checked(path, clip, up_is_known=up_is_known))
+    return clips
+
+
+def _read_nested(path: Path, npz: NpzFile) -> list[Clip]:
+    held = npz["positions_3d"]
+    subjects = held.item() if held.dtype == object and held.size == 1 else None
+    if not isinstance(subjects, dict) or not all(isinstance(v, dict) for v in subjects.values()):
+        raise MocapError(path, "positions_3d must hold a dict subject → action → positions")
+    clips = []
+    for subject, actions in subjects.items():
+        for action, values in actions.items():
+            positions = _numbers(path, f"{subject} {action}", values)
+            joints = positions.shape[1] if positions.ndim == 3 else 0
+            if joints not in _NESTED or positions.shape[2] != 3:
+                shapes = ", ".join(str(known) for known in _NESTED)
+                raise MocapError(
+                    path, f"{subject} {action} is {positions.shape}; wanted are {shapes} joints"
+                )
+            dataset, order, rate_hz, licence = _NESTED[joints]
+            positions, _ = _with_y_up(path, positions[:, order] * _MM_PER_M, "Z")
+            clip = Clip(
+                name=f"{subject}_{action}".replace(" ", "_").replace("/", "_"),
+                subject=str(subject),
+                action=str(action),
+                frame_rate_hz=rate_hz,
+                positions_mm=positions.astype(np.float32),
+                frames=np.arange(len(positions), dtype=np.int64),
+                findings=(f"{dataset}, {joints} joints: metres, Z up",),
+                licence=licence,
+            )
+            clips.append(checked(path, clip, up_is_known=True, bones_are_known=True))
+    return clips
+
+
+def _read_smpl(path: Path, npz: NpzFile) -> Clip:
+    joints = _numbers(path, "joints", npz["joints"])
+    if joints.ndim != 3 or joints.shape[1] < 22 or joints.shape[2] != 3:
+        raise MocapError(path, f"joints are {joints.shape}; wanted is (F, 22 or more, 3)")
+    positions, _ = _with_y_up(path, joints[:, SMPL] * _MM_PER_M, "Z")
+    neck = positions[:, NECK]
+    trunk = np.linalg.norm(neck - root_of(positions), axis=-1)
+    reach = HEAD_PER_TRUNK * float(np.median(trunk))
+    positions[:, HEAD_TOP] = neck + reach * unit(positions[:, HEAD_TOP] - neck)
+    rate = next((name for name in _RATES if name in npz), "fps")
+    clip = Clip(
+        name=path.stem,
+        subject=npz.text("subject"),
+        action=npz.text("action"),
+        frame_rate_hz=npz.number(rate),
+        positions_mm=positions.astype(np.float32),
+        frames=np.arange(len(positions), dtype=np.int64),
+        findings=(f"SMPL joints: metres, Z up; head top {reach:.0f} mm beyond the neck assumed",),
+    )
+    return checked(path, clip)
+
+
+def _with_y_up(path: Path, positions: Float, up_axis: str) -> tuple[Float, bool]:
+    """Positions turned so that Y is up, and whether the up axis was known."""
+    if up_axis == "Z":
+        turned: Float = positions[..., [0, 2, 1]] * (1.0, 1.0, -1.0)
+        return turned, True
+    if up_axis not in ("", "Y"):
+        raise MocapError(path, f"up_axis {up_axis!r} is not supported; Y or Z")
+    return positions, up_axis == "Y"
+
+
+def _numbers(path: Path, name: str, values: Any) -> Float:
+    array = np.asarray(values)
+    if array.dtype.kind not in "fiu":
+        raise MocapError(path, f"{name} is not an array of numbers")
+    return array.astype(np.float64)
+
+
+def _column(path: Path, npz: NpzFile, name: str, n: int, otherwise: Frames) -> Frames:
+    if name not in npz:
+        return otherwise
+    values = npz[name]
+    if values.shape != (n,) or values.dtype.kind not in "iu":
+        raise MocapError(path, f"{name} must be {n} whole numbers, one a pose")
+    return values.astype(np.int64)
