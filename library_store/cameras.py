@@ -49,21 +49,19 @@ def rotations(cameras: ArrayLike) -> Float:
     azimuth, elevation, roll = (np.radians(table[..., column]) for column in range(3))
     sin_a, cos_a = np.sin(azimuth), np.cos(azimuth)
     sin_e, cos_e = np.sin(elevation), np.cos(elevation)
-    zero = np.zeros_like(sin_a)
-    right = np.stack([cos_a, zero, -sin_a], axis=-1)
-    forward = -np.stack([sin_a * cos_e, sin_e, cos_a * cos_e], axis=-1)
-    down = np.cross(forward, right)
-    level = np.stack([right, down, forward], axis=-2)
-    sin_r, cos_r, one = np.sin(roll), np.cos(roll), np.ones_like(roll)
-    about_axis = np.stack(
-        [
-            np.stack([cos_r, -sin_r, zero], axis=-1),
-            np.stack([sin_r, cos_r, zero], axis=-1),
-            np.stack([zero, zero, one], axis=-1),
-        ],
-        axis=-2,
-    )
-    rotation: Float = about_axis @ level
+    sin_r, cos_r = np.sin(roll), np.cos(roll)
+    # Of the level camera: right (cos a, 0, -sin a), down (forward x right) and forward.
+    down_x, down_y, down_z = sin_e * sin_a, -cos_e, sin_e * cos_a
+    rotation = np.empty((*azimuth.shape, 3, 3))
+    rotation[..., 0, 0] = cos_r * cos_a - sin_r * down_x
+    rotation[..., 0, 1] = -sin_r * down_y
+    rotation[..., 0, 2] = -cos_r * sin_a - sin_r * down_z
+    rotation[..., 1, 0] = sin_r * cos_a + cos_r * down_x
+    rotation[..., 1, 1] = cos_r * down_y
+    rotation[..., 1, 2] = -sin_r * sin_a + cos_r * down_z
+    rotation[..., 2, 0] = -sin_a * cos_e
+    rotation[..., 2, 1] = -sin_e
+    rotation[..., 2, 2] = -cos_a * cos_e
     return rotation
 
 

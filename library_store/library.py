@@ -142,6 +142,11 @@ class Library:
         rows = self._cameras[self._projections[np.asarray(entries, dtype=np.int64), 1]]
         return camera_geometry.extrinsics(rows, self.poses_mm(entries))
 
+    def rotations(self, entries: ArrayLike) -> Float:
+        """R of :meth:`cameras` alone, (..., 3, 3) float64."""
+        rows = self._projections[np.asarray(entries, dtype=np.int64), 1]
+        return camera_geometry.rotations(self._cameras[rows])
+
     def descriptors(self, entries: ArrayLike) -> NDArray[np.float32]:
         """Descriptors of entries (...): (..., 28) float32."""
         return self._descriptors[np.asarray(entries, dtype=np.int64)]

@@ -149,39 +149,36 @@ def fuse(
         settings: the local prior.
 
     """
-    n_joints = len(points)
+    n = len(points)
     seen = np.flatnonzero(confidence > 0)
     rows = (2 * seen[:, None] + np.arange(2)).ravel()
-    observed = ensemble.px_per_unit * points[seen].ravel()
-    weights = _kernel_weights(ensemble, seen, observed, settings)
+    observed = ensemble.px_per_unit * points.ravel()
+    weights = _kernel_weights(ensemble, rows, observed, settings)
 
-    positions = ensemble.positions_px.reshape(len(weights), -1)
-    mean_position, mean_depth = weights @ positions, weights @ ensemble.depths
-    root = np.sqrt(weights)[:, None]
-    image_anomalies = root * (positions - mean_position)
-    depth_anomalies = root * (ensemble.depths - mean_depth)
-    local = localisation(settings.localisation_bones)
-    image_cov = _localise(local[:, None, :, None], image_anomalies.T @ image_anomalies)
-    np.fill_diagonal(image_cov, np.diag(image_cov) + settings.granularity_px**2)
-    depth_image_cov = _localise(local[:, :, None], depth_anomalies.T @ image_anomalies)
-    depth_cov = local * (depth_anomalies.T @ depth_anomalies)
+    # Image coordinates first, depths after them.
+    members = np.concatenate(
+        [ensemble.positions_px.reshape(len(weights), 2 * n), ensemble.depths], axis=1
+    )
+    mean = weights @ members
+    anomalies = np.sqrt(weights)[:, None] * (members - mean)
+    covariance = _coordinate_factors(settings.localisation_bones) * (anomalies.T @ anomalies)
+    image = np.arange(2 * n)
+    covariance[image, image] += settings.granularity_px**2
 
-    innovation = observed - mean_position[rows]
-    prior = image_cov[np.ix_(rows, rows)]
+    innovation = observed[rows] - mean[rows]
+    gain = covariance[:, rows]
+    prior = gain[rows]
     if covariance_px2 is not None:
-        stated = np.zeros_like(prior)
-        for i, joint in enumerate(seen):
-            stated[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = covariance_px2[joint] / confidence[joint]
-        prior = prior + stated
+        blocks = prior.reshape(len(seen), 2, len(seen), 2)
+        each = np.arange(len(seen))
+        blocks[each, :, each] += covariance_px2[seen] / confidence[seen, None, None]
     evidence = _Evidence(prior, innovation, np.square(settings.noise_px))
-    precision = evidence.mean_precision
-    gain_image, gain_depth = image_cov[:, rows], depth_image_cov[:, rows]
-    pull = precision @ innovation
-    position = (mean_position + gain_image @ pull).reshape(n_joints, 2)
-    depth = mean_depth + gain_depth @ pull
+    pulled = gain @ evidence.mean_precision
+    updated = mean + pulled @ innovation
+    position, depth = updated[: 2 * n].reshape(n, 2), updated[2 * n :]
 
-    position_var = np.diag(image_cov) - ((gain_image @ precision) * gain_image).sum(1)
-    depth_post = depth_cov - gain_depth @ precision @ gain_depth.T
+    position_var = covariance[image, image] - (pulled[: 2 * n] * gain[: 2 * n]).sum(1)
+    depth_post = covariance[2 * n :, 2 * n :] - pulled[2 * n :] @ gain[2 * n :].T
     root_depth = float(weights @ ensemble.root_depth_mm)
     suspect = evidence.suspect(confidence[seen], settings.outlier_prior)
     return FusedPose(
@@ -193,10 +190,12 @@ def fuse(
 
 
 def _kernel_weights(
-    ensemble: Ensemble, seen: Integers, observed: Floats, settings: FusionSettings
+    ensemble: Ensemble, rows: Integers, observed: Floats, settings: FusionSettings
 ) -> Floats:
-    """(K,) weights of the neighbours, summing to 1, by their image distance."""
-    flat = ensemble.positions_px[:, seen].reshape(len(ensemble.positions_px), -1)
+    """(K,) weights of the neighbours, summing to 1, by their distance in the image ``rows``."""
+    flat = ensemble.positions_px.reshape(len(ensemble.positions_px), -1)
+    if len(rows) < flat.shape[1]:
+        flat, observed = flat[:, rows], observed[rows]
     squared = ((flat - observed) ** 2).sum(1)
     # Per coordinate; two coordinates a joint less the translation and scale already fitted.
     nearest = squared.min() / max(len(observed) - 4, 1)
@@ -206,12 +205,14 @@ def _kernel_weights(
     return normalised
 
 
-def _localise(factors: Floats, covariance: Floats) -> Floats:
-    """Covariance of (J, ·) coordinates times the factor of their joints."""
-    n = LSP14.n_joints
-    split = [side for size in covariance.shape for side in ((n,) if size == n else (n, 2))]
-    localised: Floats = (covariance.reshape(split) * factors).reshape(covariance.shape)
-    return localised
+@cache
+def _coordinate_factors(bones: float) -> Floats:
+    """:func:`localisation` by coordinate: (3 J, 3 J), image coordinates first, then depths."""
+    joints = np.arange(LSP14.n_joints)
+    joint_of = np.concatenate([np.repeat(joints, 2), joints])
+    factors: Floats = localisation(bones)[np.ix_(joint_of, joint_of)]
+    factors.flags.writeable = False
+    return factors
 
 
 def _spread_about_root(position_var: Floats, depth_cov: Floats, root_depth_mm: float) -> Floats:
@@ -232,17 +233,15 @@ class _Evidence:
     """
 
     def __init__(self, prior: Floats, innovation: Floats, noise_var: Floats) -> None:
-        values, vectors = np.linalg.eigh(prior)
-        values = np.maximum(values, 0.0)
-        total = values + noise_var[:, None]
-        rotated = vectors.T @ innovation
-        self._precisions = (vectors / total[:, None, :]) @ vectors.T
-        self._innovation = innovation
-        self._log_evidence = -0.5 * (np.log(total) + rotated**2 / total).sum(1)
+        values, self._vectors = np.linalg.eigh(prior)
+        total = np.maximum(values, 0.0) + noise_var[:, None]
+        self._inverse = 1.0 / total
+        self._rotated = innovation @ self._vectors
+        self._log_evidence = -0.5 * (np.log(total) + self._rotated**2 * self._inverse).sum(1)
         share = np.exp(self._log_evidence - self._log_evidence.max())
         share /= share.sum()
         self.mean_noise_var = float(share @ noise_var)
-        self.mean_precision: Floats = np.tensordot(share, self._precisions, 1)
+        self.mean_precision: Floats = (self._vectors * (share @ self._inverse)) @ self._vectors.T
 
     def suspect(self, confidence: Floats, outlier_prior: float) -> int | None:
         """The joint (row of the seen ones) that is more probably elsewhere than noisy, if any.
@@ -250,22 +249,19 @@ class _Evidence:
         Compares "all joints are where they say" with "all but j, and j is anywhere within
         :data:`OUTLIER_SIGMA_PX`", each at its own noise level.
         """
-        n = len(confidence)
-        pairs = np.arange(n)[:, None] * 2 + np.arange(2)
-        block = self._precisions[:, pairs[:, :, None], pairs[:, None, :]]
-        pulled = (self._precisions @ self._innovation).reshape(-1, n, 2)
-        a, b, c = block[..., 0, 0], block[..., 0, 1], block[..., 1, 1]
+        # The 2 x 2 blocks (a, b; b, c) of the precision, and the pull (p, q), at every level.
+        x, y = self._vectors[0::2], self._vectors[1::2]
+        a, b, c = self._inverse @ np.stack([x * x, x * y, y * y]).swapaxes(1, 2)
+        pull = (self._rotated * self._inverse) @ self._vectors.T
+        p, q = pull[:, 0::2], pull[:, 1::2]
         determinant = a * c - b * b
-        left_out = (
-            c * pulled[..., 0] ** 2
-            - 2 * b * pulled[..., 0] * pulled[..., 1]
-            + a * pulled[..., 1] ** 2
-        ) / determinant
+        # The residual about the prediction by the other joints is B⁻¹ times the pull.
+        residual_x = (c * p - b * q) / determinant
+        residual_y = (a * q - b * p) / determinant
+        left_out = residual_x * p + residual_y * q
         without = self._log_evidence[:, None] + 0.5 * (left_out - np.log(determinant))
         # What the joint's own position would have cost as an outlier: a broad Gaussian about the
-        # prediction of the others, whose residual is B⁻¹ times the pull.
-        residual_x = (c * pulled[..., 0] - b * pulled[..., 1]) / determinant
-        residual_y = (a * pulled[..., 1] - b * pulled[..., 0]) / determinant
+        # prediction by the others.
         elsewhere = -0.5 * (residual_x**2 + residual_y**2) / OUTLIER_SIGMA_PX**2
         elsewhere = elsewhere - np.log(OUTLIER_SIGMA_PX**2)
         wrong = np.clip(1.0 - confidence, outlier_prior, 1.0 - outlier_prior)

@@ -227,7 +227,7 @@ class Lifter:
             entries=entries,
             distances=matches.distances[0],
             poses_mm=self._library.poses_mm(entries),
-            rotations=self._library.cameras(entries)[0],
+            rotations=self._library.rotations(entries),
         )
 
     def _fuse(self, view: CentredView, confidence: Floats, neighbours: _Neighbours) -> FusedPose:
@@ -289,30 +289,32 @@ class Lifter:
     ) -> tuple[Hypothesis, ...]:
         """The n most probable candidates in the photo's camera frame."""
         present = confidence > 0
-        hypotheses = []
-        for rank, entry in enumerate(shortlist.entries[:n]):
-            joints = view.to_photo(shortlist.cameras.points_mm[rank])
-            pixels = project(
-                joints, intrinsics.focal_length_px, np.array(intrinsics.principal_point_px)
+        cameras = shortlist.cameras
+        joints = view.to_photo(cameras.points_mm[:n])
+        # One product a candidate, so that the bytes do not depend on how many there are.
+        translations = view.to_photo(cameras.translation_mm[:n, None])[:, 0]
+        rotations = view.rotation.T @ cameras.rotation[:n]
+        pixels = project(
+            joints[:, present], intrinsics.focal_length_px, np.array(intrinsics.principal_point_px)
+        )
+        errors = np.sqrt(((pixels - person.joints_px[present]) ** 2).sum(-1).mean(-1))
+        if subject_height_mm is not None:
+            scale = subject_height_mm / stature_mm(joints)
+            joints, translations = scale[:, None, None] * joints, scale[:, None] * translations
+        return tuple(
+            Hypothesis(
+                entry=entry,
+                exemplar_id=self._library.exemplar_id(entry),
+                source=self._library.source(entry),
+                probability=float(shortlist.probabilities[rank]),
+                distance=float(shortlist.distances[rank]),
+                reprojection_error_px=float(errors[rank]),
+                rotation=rotations[rank],
+                translation_mm=translations[rank],
+                joints_mm=joints[rank],
             )
-            error = ((pixels[present] - person.joints_px[present]) ** 2).sum(-1)
-            scale = 1.0
-            if subject_height_mm is not None:
-                scale = subject_height_mm / float(stature_mm(joints))
-            hypotheses.append(
-                Hypothesis(
-                    entry=int(entry),
-                    exemplar_id=self._library.exemplar_id(int(entry)),
-                    source=self._library.source(int(entry)),
-                    probability=float(shortlist.probabilities[rank]),
-                    distance=float(shortlist.distances[rank]),
-                    reprojection_error_px=float(np.sqrt(error.mean())),
-                    rotation=view.rotation.T @ shortlist.cameras.rotation[rank],
-                    translation_mm=scale * view.to_photo(shortlist.cameras.translation_mm[rank]),
-                    joints_mm=scale * joints,
-                )
-            )
-        return tuple(hypotheses)
+            for rank, entry in enumerate(shortlist.entries[:n].tolist())
+        )
 
 
 def _no_lap(_: str) -> None:

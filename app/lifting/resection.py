@@ -51,16 +51,25 @@ def initial_translation(rotated_mm: Floats, targets: Floats, weights: Floats) ->
         (..., 3) mm, in front of the camera also when the joints say nothing about depth.
 
     """
-    total = weights.sum(-1)
-    shift = targets * rotated_mm[..., 2:] - rotated_mm[..., :2]
-    mean_target = (weights[..., None] * targets).sum(-2) / total[..., None]
-    mean_shift = (weights[..., None] * shift).sum(-2) / total[..., None]
-    spread = weights[..., None] * (targets - mean_target[..., None, :])
+    total = weights.sum(-1)[..., None]
+    share = weights / total
+    mean_target = (share[..., None] * targets).sum(-2)
+    spread = share[..., None] * (targets - mean_target[..., None, :])
+    # With shift = x Z - X all that is needed is linear in the points: mean(shift) and the
+    # spread's moment with it.
+    loads = np.zeros((*spread.shape[:-1], 3, 3))
+    loads[..., 0, 0] = loads[..., 1, 1] = -share
+    loads[..., :2, 2] = -spread
+    loads[..., 2, :2] = share[..., None] * targets
+    loads[..., 2, 2] = (spread * targets).sum(-1)
+    flat = 3 * targets.shape[-2]
+    moments = rotated_mm.reshape(*rotated_mm.shape[:-2], 1, flat) @ loads.reshape(
+        *loads.shape[:-3], flat, 3
+    )
     # The first two unknowns eliminated: t_xy = mean(shift) + mean(x) t_z.
-    moment = (spread * targets).sum((-1, -2))
-    depth = -(spread * shift).sum((-1, -2)) / np.maximum(moment, 1e-12)
-    depth = np.maximum(depth, _nearest_depth(rotated_mm))
-    return np.concatenate([mean_shift + mean_target * depth[..., None], depth[..., None]], axis=-1)
+    depth = -moments[..., 0, 2] / np.maximum((spread * targets).sum((-1, -2)), 1e-12)
+    depth = np.maximum(depth, _nearest_depth(rotated_mm))[..., None]
+    return np.concatenate([moments[..., 0, :2] + mean_target * depth, depth], axis=-1)
 
 
 def resect(
@@ -97,24 +106,24 @@ def resect(
     rotated = points @ np.swapaxes(rotation, 1, 2)
     translation = initial_translation(rotated, observed, base_weights)
     damping = np.full(len(points), _INITIAL_DAMPING)
-    residuals = normalised_projection(rotated + translation[:, None]) - observed
+    residuals = _residuals(rotated, translation, observed)
     for _ in range(iterations):
-        weight = base_weights
+        weight = base_weights[:, None]
         if robust_scale is not None:
             # IRLS: the weight of this step is held while the step is judged.
-            weight = base_weights / (1.0 + (residuals**2).sum(-1) / robust_scale**2)
-        cost = (weight[..., None] * residuals**2).sum((1, 2))
+            squared = (residuals**2).sum(1, keepdims=True)
+            weight = weight / (1.0 + squared / robust_scale**2)
         jacobian = projection_jacobian(rotated, translation)
-        step = _damped_step(jacobian, residuals, weight, damping)
+        step, cost = _damped_step(jacobian, residuals, weight, damping)
         new_rotation = rotation_exponential(step[:, :3]) @ rotation
         new_rotated = points @ np.swapaxes(new_rotation, 1, 2)
         new_translation = translation + step[:, 3:]
         ahead = new_translation[:, 2] >= _nearest_depth(new_rotated)
         new_translation[~ahead] = translation[~ahead]
-        new_residuals = normalised_projection(new_rotated + new_translation[:, None]) - observed
-        new_cost = (weight[..., None] * new_residuals**2).sum((1, 2))
+        new_residuals = _residuals(new_rotated, new_translation, observed)
+        new_cost = (weight * new_residuals**2).sum((1, 2))
         better = ahead & (new_cost <= cost)
-        damping = np.where(better, damping * 0.1, damping * 10.0)
+        damping *= np.where(better, 0.1, 10.0)
         keep = better[:, None, None]
         rotation = np.where(keep, new_rotation, rotation)
         rotated = np.where(keep, new_rotated, rotated)
@@ -124,7 +133,7 @@ def resect(
         rotation.reshape(*lead, 3, 3),
         translation.reshape(*lead, 3),
         (rotated + translation[:, None]).reshape(*lead, joints, 3),
-        residuals.reshape(*lead, joints, 2),
+        np.swapaxes(residuals, 1, 2).reshape(*lead, joints, 2),
     )
 
 
@@ -164,28 +173,46 @@ def projection_jacobian(rotated_mm: Floats, translation_mm: Floats) -> Floats:
 
 def rotation_exponential(omega: Floats) -> Floats:
     """Rotation matrices (B, 3, 3) of rotation vectors (B, 3), by Rodrigues' formula."""
-    angle = np.sqrt((omega**2).sum(-1))
-    safe = np.maximum(angle, 1e-8)
-    first = np.where(angle > 1e-8, np.sin(safe) / safe, 1.0)
-    second = np.where(angle > 1e-8, (1.0 - np.cos(safe)) / safe**2, 0.5)
-    skew = np.zeros((len(omega), 3, 3))
-    skew[:, 0, 1], skew[:, 0, 2], skew[:, 1, 2] = -omega[:, 2], omega[:, 1], -omega[:, 0]
-    skew -= np.swapaxes(skew, 1, 2)
-    return np.eye(3) + first[:, None, None] * skew + second[:, None, None] * (skew @ skew)
+    squared = (omega**2).sum(-1)
+    half = np.maximum(0.5 * np.sqrt(squared), 1e-8)
+    sinc = np.sin(half) / half
+    # sin(a)/a and (1 - cos a)/a², by the half angle: exact also where a vanishes.
+    first, second = sinc * np.cos(half), 0.5 * sinc**2
+    rotation: Floats = omega[:, :, None] * (second[:, None] * omega)[:, None, :]
+    rotation += ((first[:, None] * omega) @ _GENERATORS).reshape(-1, 3, 3)
+    rotation += (1.0 - second * squared)[:, None, None] * np.eye(3)
+    return rotation
 
 
-def _damped_step(jacobian: Floats, residuals: Floats, weights: Floats, damping: Floats) -> Floats:
-    """Solve (JᵀWJ + λ diag) δ = -JᵀWr for the batch; returns (B, 6)."""
+_GENERATORS = np.zeros((3, 9))
+_GENERATORS[[0, 1, 2], [7, 2, 3]] = 1.0
+_GENERATORS[[0, 1, 2], [5, 6, 1]] = -1.0
+"""(3, 9): a rotation vector times this is its cross-product matrix, row by row."""
+
+
+def _residuals(rotated_mm: Floats, translation_mm: Floats, observed: Floats) -> Floats:
+    """Projection minus observation (B, J, 2), as (B, 2, J)."""
+    residuals = normalised_projection(rotated_mm + translation_mm[:, None]) - observed
+    return np.swapaxes(residuals, 1, 2)
+
+
+def _damped_step(
+    jacobian: Floats, residuals: Floats, weights: Floats, damping: Floats
+) -> tuple[Floats, Floats]:
+    """Solve (JᵀWJ + λ diag) δ = -JᵀWr for the batch; returns δ (B, 6) and the cost rᵀWr (B,)."""
     batch = len(jacobian)
-    weighted = (jacobian * weights[:, None, None, :]).reshape(batch, 6, -1)
-    normal = weighted @ np.swapaxes(jacobian.reshape(batch, 6, -1), 1, 2)
-    gradient = weighted @ np.swapaxes(residuals, 1, 2).reshape(batch, -1, 1)
+    # The residuals as a seventh column: one product gives JᵀWJ, JᵀWr and rᵀWr.
+    both = np.concatenate([jacobian, residuals[:, None]], axis=1)
+    weighted = (both * weights[:, None]).reshape(batch, 7, -1)
+    products = weighted @ np.swapaxes(both.reshape(batch, 7, -1), 1, 2)
+    normal, gradient = products[:, :6, :6], products[:, :6, 6:]
     diagonal = np.arange(6)
     curvature: Floats = normal[:, diagonal, diagonal]
     # The floor keeps the system solvable when the joints leave a direction undetermined.
     floor = 1e-12 * curvature.max(1, keepdims=True) * _UNIT_BALANCE + 1e-300
     normal[:, diagonal, diagonal] = curvature * (1.0 + damping[:, None]) + floor
-    return np.asarray(-np.linalg.solve(normal, gradient)[..., 0], dtype=np.float64)
+    step = np.asarray(-np.linalg.solve(normal, gradient)[..., 0], dtype=np.float64)
+    return step, products[:, 6, 6]
 
 
 _UNIT_BALANCE = np.array([1.0, 1.0, 1.0, 1e-6, 1e-6, 1e-6])
