@@ -59,6 +59,7 @@ INDEX_FILE = "cmu_index.csv"
 """Looked for beside the clip and in the three folders above: actions and frame rates by clip."""
 
 _NO_BONE = "root"
+_ROOT_ORDER = ("tx", "ty", "tz", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True)
@@ -159,13 +160,21 @@ def read_asf(path: Path) -> SkeletonFile:
             raise MocapError(path, "angles in radians are not supported; CMU's files use degrees")
         root = {words[0]: words[1:] for words in sections["root"]}
         parents = {child: words[0] for words in sections["hierarchy"] for child in words[1:]}
+        seen = [_NO_BONE]
+        for child, parent in parents.items():
+            if parent not in seen:
+                raise ValueError(f"bone {child} hangs on {parent}, which is not above it")
+            seen.append(child)
         at_rest = {bone["name"][0]: bone for bone in _blocks(sections["bonedata"])}
         bones = {name: _bone(at_rest[name], parent) for name, parent in parents.items()}
         orientation = np.array([float(v) for v in root["orientation"]])
         axes = root["axis"][0].lower()
+        order = tuple(word.lower() for word in root["order"])
+        if sorted(order) != sorted(_ROOT_ORDER) or sorted(axes) != ["x", "y", "z"]:
+            raise ValueError(f"root with order {order} and axis {axes}")
         return SkeletonFile(
             bones=bones,
-            root_order=tuple(word.lower() for word in root["order"]),
+            root_order=order,
             root_axes=axes,
             root_frame=euler(axes[::-1], orientation[::-1]),
             mm_per_unit=MM_PER_INCH / float(units["length"]),
@@ -178,11 +187,14 @@ def _bone(block: dict[str, list[str]], parent: str) -> Bone:
     direction = np.array([float(v) for v in block["direction"][:3]])
     *angles, axes = block["axis"]
     axes = axes.lower()
+    dof = tuple(word.lower() for word in block.get("dof", ()))
+    if len(angles) != 3 or direction.shape != (3,) or not {"rx", "ry", "rz"}.issuperset(dof):
+        raise ValueError(f"bone {block['name'][0]}: direction, axis or dof {dof}")
     return Bone(
         parent=parent,
         offset=direction * float(block["length"][0]),
         frame=euler(axes[::-1], np.array([float(v) for v in angles])[::-1]),
-        dof=tuple(word.lower() for word in block.get("dof", ())),
+        dof=dof,
     )
 
 
@@ -227,6 +239,8 @@ def read_amc(path: Path, asf: SkeletonFile) -> tuple[Frames, dict[str, Float]]:
                 raise ValueError(f"{widths[words[0]]} values expected")
             else:
                 values[words[0]].append([float(word) for word in words[1:]])
+                if len(values[words[0]]) != len(frames):
+                    raise ValueError("the bone is missing in a frame before, or is here twice")
         except (ValueError, KeyError) as error:
             raise MocapError(path, f"line {number}: {line.strip()!r}: {error!r}") from error
     short = [name for name, rows in values.items() if len(rows) != len(frames)]

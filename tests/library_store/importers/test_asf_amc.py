@@ -100,6 +100,10 @@ def test_a_cut_clip_is_refused(clip_file: Path) -> None:
     clip_file.write_text("\n".join(lines[:-3]))
     with pytest.raises(MocapError, match="12 frames"):
         read(clip_file)
+    moved = [*lines[:-1], lines[5], lines[-1]]  # a bone twice in the last frame
+    clip_file.write_text("\n".join(moved))
+    with pytest.raises(MocapError, match="twice"):
+        read(clip_file)
     clip_file.write_text("\n".join(lines)[:-60])
     with pytest.raises(MocapError, match=str(clip_file)):
         read(clip_file)
@@ -110,6 +114,14 @@ def test_a_skeleton_without_a_bone_is_refused(clip_file: Path) -> None:
     asf.write_text(ASF.replace("name rwrist", "name rpaw"))
     with pytest.raises(MocapError, match="rwrist"):
         read(clip_file)
+    for old, new in (
+        ("dof rx ry rz", "dof rx ry rq"),
+        ("order TX", "order TQ"),
+        ("    lfemur lt", "    lfemu lt"),
+    ):
+        asf.write_text(ASF.replace(old, new))
+        with pytest.raises(MocapError, match=r"02\.asf: not a whole ASF"):
+            read(clip_file)
     asf.unlink()
     with pytest.raises(MocapError, match=r"ASF skeleton.*found: none"):
         read(clip_file)
