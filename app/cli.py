@@ -1,4 +1,4 @@
-"""The ``posematch`` command: serve, library build|info|verify, predict, version."""
+"""The ``posematch`` command: serve, library build|info|verify|import, predict, version."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import cv2
 import typer
 import uvicorn
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -35,6 +36,7 @@ from library_store.build import (
     verify_library,
 )
 from library_store.errors import LibraryError
+from library_store.importers import Clip, MocapError, read_all, write_npz
 from library_store.manifest import Manifest
 from library_store.prior import DEFAULT_PRIOR, PosePrior
 
@@ -57,6 +59,9 @@ def main() -> None:
         cli()
     except RequestError as error:
         notices.print(f"[red]error:[/red] {error.detail}", highlight=False, soft_wrap=True)
+        sys.exit(1)
+    except MocapError as error:
+        notices.print(f"[red]error:[/red] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(1)
     except (PoseMatchError, LibraryError) as error:
         notices.print(f"[red]cannot start:[/red] {error}", highlight=False, soft_wrap=True)
@@ -222,6 +227,45 @@ def verify() -> None:
     directory = _build_if_missing(settings)
     verify_library(directory)
     output.print(f"{directory}: whole", highlight=False)
+
+
+@library_cli.command("import")
+def import_mocap(
+    paths: Annotated[
+        list[Path], typer.Argument(exists=True, help="AMC (with its ASF), BVH, npz, or folders.")
+    ],
+    out: Annotated[Path, typer.Option(help="Write the clips here, as one npz file.")],
+    mapping: Annotated[
+        Path | None,
+        typer.Option(exists=True, dir_okay=False, help="JSON: lsp14 joint to BVH joint."),
+    ] = None,
+    fps: Annotated[float, typer.Option(min=0.1, help="Keep at least so many poses a second.")] = 30,
+    strict: Annotated[bool, typer.Option(help="Refuse all if one file cannot be read.")] = False,
+) -> None:
+    """Read motion capture files as 14-joint poses in mm, Y up, and say what was noticed."""
+    if out.suffix.lower() != ".npz":
+        raise typer.BadParameter("must end in .npz", param_hint="--out")
+    clips, skipped = read_all(paths, mapping=mapping, strict=strict)
+    for error in skipped:
+        notices.print(
+            f"[yellow]skipped:[/yellow] {escape(str(error))}", highlight=False, soft_wrap=True
+        )
+    kept = [clip.thinned(fps) for clip in clips]
+    write_npz(out, kept)
+    output.print(_clips_table(kept))
+    poses = sum(len(clip) for clip in kept)
+    total = f"{len(kept)} clips, {poses} poses; {len(skipped)} files skipped"
+    output.print(f"{out}: {total}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _clips_table(clips: list[Clip]) -> Table:
+    table = Table()
+    for heading in ("clip", "subject", "action", "poses", "noticed"):
+        table.add_column(heading, justify="right" if heading == "poses" else "left")
+    for clip in clips:
+        said = (clip.name, clip.subject, clip.action, str(len(clip)), "; ".join(clip.findings))
+        table.add_row(*map(escape, said))
+    return table
 
 
 def _print_manifest(manifest: Manifest) -> None:

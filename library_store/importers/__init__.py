@@ -1,6 +1,7 @@
 """Motion capture files as users have them, read as clips of 14-joint poses in mm, Y up."""
 
 from library_store.importers.clip import Clip, MocapError
+from library_store.importers.npz import write as write_npz
 from library_store.importers.reader import read, read_all
 
-__all__ = ["Clip", "MocapError", "read", "read_all"]
+__all__ = ["Clip", "MocapError", "read", "read_all", "write_npz"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -54,3 +54,16 @@ class Clip:
 
     def __len__(self) -> int:
         return len(self.frames)
+
+    def thinned(self, rate_hz: float) -> Clip:
+        """Every n-th pose, as few as still give ``rate_hz``; all where the rate is not known."""
+        # Rates such as 119.98 for 120 must still be thinned by four to 30.
+        step = int(self.frame_rate_hz / rate_hz + 0.01) if np.isfinite(self.frame_rate_hz) else 1
+        if step <= 1:
+            return self
+        return replace(
+            self,
+            frame_rate_hz=self.frame_rate_hz / step,
+            positions_mm=self.positions_mm[::step],
+            frames=self.frames[::step],
+        )

@@ -7,11 +7,13 @@ import subprocess
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 from app.schemas import PosesAnswer
 from app.version import VERSION
 from tests.app.conftest import RENDERS
 from tests.app.server import COMMAND, environment
+from tests.library_store.importers.files import cmu_bvh, walk
 
 
 def run(*arguments: object, **settings: object) -> subprocess.CompletedProcess[str]:
@@ -50,6 +52,28 @@ def test_predict_refuses_what_is_no_photo(library_dir: Path, tmp_path: Path) -> 
     assert done.returncode == 1
     assert "image/jpeg" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_library_import(tmp_path: Path) -> None:
+    (tmp_path / "02_01.bvh").write_text(cmu_bvh(walk()))
+    (tmp_path / "bad.bvh").write_text("HIERARCHY")
+    out = tmp_path / "out" / "clips.npz"
+    out.parent.mkdir()
+    done = run("library", "import", tmp_path, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "1 clips, 3 poses; 1 files skipped" in done.stdout
+    assert "bad.bvh: not a BVH file" in done.stderr
+    with np.load(out) as written:
+        assert written["positions"].shape == (3, 14, 3)
+        assert written["frame"].tolist() == [1, 5, 9]
+        assert written["clip_subject"].tolist() == ["cmu_02"]
+        assert "CMU" in str(written["license"])
+    out.unlink()
+    done = run("library", "import", tmp_path, "--out", out, "--strict")
+    assert done.returncode == 1
+    assert "error:" in done.stderr
+    assert "bad.bvh" in done.stderr
+    assert not out.exists()
 
 
 def test_library_commands(library_dir: Path, tmp_path: Path) -> None:

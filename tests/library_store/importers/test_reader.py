@@ -2,10 +2,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from library_store.errors import LibraryError
-from library_store.importers import MocapError, read, read_all
+from library_store.importers import Clip, MocapError, read, read_all
 from tests.library_store.importers.files import ASF, amc, cmu_bvh, walk
 
 
@@ -36,3 +37,15 @@ def test_files_of_other_kinds_and_missing_ones(folder: Path) -> None:
         read(folder / "notes.txt")
     with pytest.raises(MocapError, match="cannot be read: No such file"):
         read(folder / "nothing.bvh")
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "wanted_hz", "step"),
+    [(120.0, 30.0, 4), (119.98, 30.0, 4), (50.0, 30.0, 1), (100.0, 30.0, 3), (np.nan, 30.0, 1)],
+)
+def test_thinning(rate_hz: float, wanted_hz: float, step: int) -> None:
+    positions = np.zeros((10, 14, 3), dtype=np.float32)
+    clip = Clip("a", "", "", rate_hz, positions, np.arange(10)).thinned(wanted_hz)
+    assert list(clip.frames) == list(range(0, 10, step))
+    assert clip.frame_rate_hz == pytest.approx(rate_hz / step, nan_ok=True)
+    assert len(clip.positions_mm) == len(clip)
