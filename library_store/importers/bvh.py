@@ -4,7 +4,7 @@ A joint's rotation is the product of its rotation channels in the order listed, 
 parent, and turns the offsets of its children; position channels replace the joint's own offset.
 Offsets have no stated unit. CMU's two conversions are known (``joint_tables``): their unit, the
 thorax and wrist bones they lost, and the T-pose that one of them puts before the first frame.
-Root-centred joints then agree with ASF/AMC of the same clip within 7 mm (1 to 4 mm on the mean over
+Root-centred joints then agree with ASF/AMC of the same clip within 7 mm (0.3 to 4 mm on the mean,
 eleven clips of four people): thoraxes are not quite as long as upper backs.
 """
 
