@@ -190,8 +190,7 @@ def sort_exactly(
 ) -> Neighbours:
     """Order candidate entries (Q, k) by their distance in float64, ties by entry."""
     entries = np.sort(entries, axis=1)
-    difference = table[entries].astype(np.float64)
-    difference -= queries[:, None]
+    difference = np.subtract(table[entries], queries[:, None], dtype=np.float64)
     distances = np.sqrt(np.einsum("qkd,qkd->qk", difference, difference))
     order = np.argsort(distances, axis=1, kind="stable")
     return Neighbours(

@@ -62,14 +62,14 @@ def initial_translation(rotated_mm: Floats, targets: Floats, weights: Floats) ->
     loads[..., :2, 2] = -spread
     loads[..., 2, :2] = share[..., None] * targets
     loads[..., 2, 2] = (spread * targets).sum(-1)
-    flat = 3 * targets.shape[-2]
-    moments = rotated_mm.reshape(*rotated_mm.shape[:-2], 1, flat) @ loads.reshape(
-        *loads.shape[:-3], flat, 3
-    )
+    loads = loads.reshape(*loads.shape[:-3], -1, 3)
+    flat = rotated_mm.reshape(*rotated_mm.shape[:-2], -1)
+    shared = loads.ndim == 2
+    moments = flat @ loads if shared else (flat[..., None, :] @ loads)[..., 0, :]
     # The first two unknowns eliminated: t_xy = mean(shift) + mean(x) t_z.
-    depth = -moments[..., 0, 2] / np.maximum((spread * targets).sum((-1, -2)), 1e-12)
+    depth = -moments[..., 2] / np.maximum((spread * targets).sum((-1, -2)), 1e-12)
     depth = np.maximum(depth, _nearest_depth(rotated_mm))[..., None]
-    return np.concatenate([moments[..., 0, :2] + mean_target * depth, depth], axis=-1)
+    return np.concatenate([moments[..., :2] + mean_target * depth, depth], axis=-1)
 
 
 def resect(
@@ -104,7 +104,10 @@ def resect(
     base_weights = np.broadcast_to(weights, (*lead, joints)).reshape(shape)
     rotation = rotations.reshape(-1, 3, 3)
     rotated = points @ np.swapaxes(rotation, 1, 2)
-    translation = initial_translation(rotated, observed, base_weights)
+    shared = targets.ndim == 2 and weights.ndim == 1
+    translation = initial_translation(
+        rotated, *((targets, weights) if shared else (observed, base_weights))
+    )
     damping = np.full(len(points), _INITIAL_DAMPING)
     residuals = _residuals(rotated, translation, observed)
     for _ in range(iterations):
