@@ -8,8 +8,9 @@ import numpy as np
 
 from models.heatmaps import Joints2D
 
-LEAST_CONFIDENCE = 0.2
-"""Mean confidence over the joints below which a box is not called a person."""
+SURE_JOINTS, LEAST_CONFIDENCE = 5, 0.6
+"""Mean confidence of that many best joints below which a box is not called a person: of a face and
+shoulders alone five joints are sure, of a chair or an arm taken for somebody hardly one."""
 SAME_PERSON = 0.1
 """Mean distance of two people's joints, over the larger extent, below which they are one."""
 
@@ -23,7 +24,7 @@ def present(people: Sequence[Joints2D]) -> list[int]:
     kept: list[int] = []
     for i, person in enumerate(people):
         belief = person.peak if person.confidence is None else person.confidence
-        if float(belief.mean()) < LEAST_CONFIDENCE:
+        if float(np.sort(belief)[-SURE_JOINTS:].mean()) < LEAST_CONFIDENCE:
             continue
         if not any(_same(person, people[k]) for k in kept):
             kept.append(i)

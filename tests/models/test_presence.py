@@ -25,6 +25,12 @@ def test_the_same_pose_twice_is_one_person() -> None:
     assert present([person(), person(3), person(80)]) == [0, 2]
 
 
+def test_somebody_cut_off_at_the_chest_is_somebody() -> None:
+    confidence = np.full(14, 0.05)
+    confidence[:5] = 0.9
+    assert present([replace(person(), confidence=confidence)]) == [0]
+
+
 def test_a_pose_that_nobody_believes_is_nobody() -> None:
     assert present([person(confidence=0.05), person(80)]) == [1]
     unsure = replace(person(), confidence=None, peak=np.full(14, 0.05))
