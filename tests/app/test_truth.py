@@ -16,8 +16,8 @@ from tests.app.server import Server
 from tests.app.test_lift_over_http import root_relative_error_mm
 from tests.app.test_poses_over_http import joints_px, post, project
 
-PCK_FLOOR = 0.55
-ERROR_CEILING_MM = 260.0
+PCK_FLOOR = 0.7
+ERROR_CEILING_MM = 230.0
 
 
 @pytest.fixture(scope="module")
