@@ -49,11 +49,10 @@ class LiftingSettings:
     to 40 px; -3.40 is chance).
 
     ``shortlist``, ``paper_shortlist``: k of eq. 4 for the two methods; ``neighbours``: ensemble of
-    the fusion, ``masked_neighbours`` the same where joints are missing, for that search costs more;
-    ``least_confidence``: joints below it count as missing; ``sigma_library_px``, ``sigma_2d_px``:
-    the two parts of eq. 4's σ in standard pixels a coordinate, the latter where the 2D's own
-    covariance is unknown; ``far_px``: RMS residual of the best candidate, in standard pixels,
-    beyond which a person is ``far_from_library`` (1 in 100 held-out people);
+    the fusion; ``least_confidence``: joints below it count as missing; ``sigma_library_px``,
+    ``sigma_2d_px``: the two parts of eq. 4's σ in standard pixels a coordinate, the latter where
+    the 2D's own covariance is unknown; ``far_px``: RMS residual of the best candidate, in standard
+    pixels, beyond which a person is ``far_from_library`` (1 in 100 held-out people);
     ``resection_iterations``: Levenberg-Marquardt steps; ``max_outliers``: joints that may be set
     aside as contradicting the rest; ``sigma``: what makes the posterior's spread a radius, None for
     no ``sigma_mm``.
@@ -62,7 +61,6 @@ class LiftingSettings:
     shortlist: int = 30
     paper_shortlist: int = 10
     neighbours: int = 200
-    masked_neighbours: int = 60
     least_confidence: float = 0.2
     sigma_library_px: float = 30.0
     sigma_2d_px: float = 6.5
@@ -218,9 +216,7 @@ class Lifter:
     def _neighbours(self, view: CentredView, present: Mask, method: Method) -> _Neighbours:
         """Eq. 4's nearest exemplars, of the joints that are present."""
         settings = self._settings
-        k = settings.neighbours if present.all() else settings.masked_neighbours
-        if method == "paper":
-            k = settings.paper_shortlist
+        k = settings.paper_shortlist if method == "paper" else settings.neighbours
         matches = self._library.match(view.points[None], present[None].astype(np.float64), k)
         entries = matches.entries[0]
         return _Neighbours(
