@@ -39,6 +39,11 @@ HALF = ".half"
 PREFIX = "network."
 
 
+RESEARCH = (
+    "trained partly on images published for research use: judge whether that suits a commercial use"
+)
+
+
 class _FromBytes(nn.Module):
     """uint8 (N, H, W, 3) BGR -> the network's last maps."""
 
@@ -165,6 +170,7 @@ def main() -> None:
             "one person per crop, the one in its centre",
             "labels are crowd-sourced or by other networks: hips and neck follow their conventions",
             "weak on rare poses, on heavy occlusion and in crowds",
+            RESEARCH,
         ]
     else:
         size = args.input_px or 320
@@ -184,6 +190,7 @@ def main() -> None:
         limits = [
             "people smaller than a tenth of the photo's longer side are often missed",
             "boxes are of the joints, not of hair, clothes or things held",
+            RESEARCH,
         ]
     network.load_state_dict(state["ema"])
     network.eval()
