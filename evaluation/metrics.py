@@ -1,7 +1,7 @@
-"""Errors of 3D and 2D poses, as the literature measures them.
+"""Errors of 3D poses, as the literature measures them.
 
-All functions are vectorised over leading dimensions (...), take float arrays in mm (3D) or px (2D)
-and return per-joint errors (..., J), so that means, medians and subsets of joints are the caller's.
+All functions are vectorised over leading dimensions (...), take float arrays in mm and return
+per-joint errors (..., J), so that means, medians and subsets of joints are the caller's.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from library_store.skeleton import L_HIP, L_SHOULDER, R_HIP, R_SHOULDER
+from library_store.skeleton import L_HIP, R_HIP
 
 Floats = npt.NDArray[np.float64]
 
@@ -54,24 +54,6 @@ def align(points: Floats, reference: Floats, *, scale: bool) -> Floats:
         size = (singular * sign).sum(-1) / np.maximum((a**2).sum((-1, -2)), 1e-12)
     moved: Floats = size[..., None, None] * (a @ rotation) + reference_centre
     return moved
-
-
-def torso_px(joints: Floats) -> Floats:
-    """The longer of the two shoulder-to-opposite-hip diagonals of (..., 14, 2): (...)."""
-    right = _distance(joints[..., R_SHOULDER, :], joints[..., L_HIP, :])
-    left = _distance(joints[..., L_SHOULDER, :], joints[..., R_HIP, :])
-    longer: Floats = np.maximum(right, left)
-    return longer
-
-
-def correct_keypoints(
-    predicted: Floats, truth: Floats, threshold: float = 0.2
-) -> npt.NDArray[np.bool_]:
-    """PCK: which of (..., 14, 2) lie within ``threshold`` torso lengths of the truth: (..., 14)."""
-    within: npt.NDArray[np.bool_] = (
-        _distance(predicted, truth) <= threshold * torso_px(truth)[..., None]
-    )
-    return within
 
 
 @dataclass(frozen=True)

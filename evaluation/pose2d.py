@@ -21,10 +21,11 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from evaluation.metrics import Floats, correct_keypoints
+from evaluation.metrics import Floats
 from library_store.skeleton import LIMB_JOINTS, LSP14
 from models import PersonBox, PoseEstimator
 from models.crop import square_crop
+from models.pck import correct_keypoints
 from models.training.dataset import MP33_LIMBS, LabelledCrop, held_out, load
 from models.training.teachers import BlazePose, onnx_session
 

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from app.lifting.types import Intrinsics, Observation
-from evaluation.metrics import Floats, torso_px
+from evaluation.metrics import Floats
 from library_store.skeleton import LSP14
+from models.pck import torso_px
 
 LIMB_ENDS = tuple(
     LSP14.index(f"{side}_{joint}")

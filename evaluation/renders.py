@@ -20,11 +20,11 @@ from app.pipeline import PhotoQuery, SeenPerson
 from app.settings import load_settings
 from evaluation.metrics import (
     Floats,
-    correct_keypoints,
     root_centred_error_mm,
     similarity_error_mm,
 )
 from library_store.skeleton import LIMB_JOINTS
+from models.pck import correct_keypoints
 
 LIMBS = list(LIMB_JOINTS)
 

@@ -25,10 +25,11 @@ from models.card import (
     read_card,
 )
 from models.heatmaps import Floats, calibrated, read_maps
+from models.pck import correct_keypoints
 from models.session import OnnxModel
 from models.training.augment import Sample, canonical, random_view
 from models.training.dataset import LabelledCrop
-from models.training.train import read_crops, torso_px
+from models.training.train import read_crops
 
 NEAR = 0.2
 """In torso lengths: what `confidence` is the probability of."""
@@ -61,13 +62,14 @@ def read_all(model: OnnxModel, output: PoseOutput, samples: list[Sample]) -> Rea
     truth = np.stack([s.joints_px for s in samples])
     weight = np.stack([s.weight for s in samples])
     presence = np.stack([s.presence for s in samples])
-    error = np.linalg.norm((at + 0.5) * output.stride_px - 0.5 - truth, axis=-1)
+    found = (at + 0.5) * output.stride_px - 0.5
+    error = np.linalg.norm(found - truth, axis=-1)
     labelled = weight > 0
     return Readings(
         features=np.concatenate([r.features for r in parts]),
         deviation_px=np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)) * output.stride_px,
         error_px=error,
-        near=labelled & (error < NEAR * torso_px(truth)[:, None]),
+        near=labelled & correct_keypoints(found, truth, NEAR),
         labelled=labelled,
         judged=labelled | (presence == 0),
     )

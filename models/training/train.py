@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from models.pck import correct_keypoints
 from models.training import loop
 from models.training.augment import Sample, canonical, random_view
 from models.training.dataset import LabelledCrop, held_out, load
@@ -21,25 +22,6 @@ from models.training.objective import total_loss
 
 DEV_LABELLED = 200
 """Labelled crops of each training file kept aside to choose by; lspet_val is only reported."""
-
-
-def torso_px(joints: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The longer of the two shoulder-to-opposite-hip diagonals, (N, 14, 2) -> (N,)."""
-    a = np.linalg.norm(joints[:, 2] - joints[:, 11], axis=-1)
-    b = np.linalg.norm(joints[:, 5] - joints[:, 8], axis=-1)
-    longest: NDArray[np.float32] = np.maximum(np.maximum(a, b), 1.0)
-    return longest
-
-
-def pck(
-    predicted: NDArray[np.float32],
-    truth: NDArray[np.float32],
-    known: NDArray[np.bool_],
-    threshold: float = 0.2,
-) -> float:
-    """Share of known joints within ``threshold`` torso lengths of the truth."""
-    error = np.linalg.norm(predicted - truth, axis=-1) / torso_px(truth)[:, None]
-    return float((error < threshold)[known].mean())
 
 
 def to_batch(samples: list[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -85,7 +67,8 @@ def measure(
         predicted.append(peaks_px(logits, model.cfg.n_joints, size))
         truth.append(joints.numpy())
         known.append(weight.numpy() > 0)
-    return pck(np.concatenate(predicted), np.concatenate(truth), np.concatenate(known))
+    correct = correct_keypoints(np.concatenate(predicted), np.concatenate(truth))
+    return float(correct[np.concatenate(known)].mean())
 
 
 def read_crops(

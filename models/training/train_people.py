@@ -57,7 +57,7 @@ def targets(
 
 
 def loss_from(out: Tensor, heat: Tensor, sides: Tensor, weight: Tensor, trust: Tensor) -> Tensor:
-    """CenterNet's focal loss on the centres plus 1 - IoU of the boxes."""
+    """CenterNet's focal loss on the centres plus -log IoU of the boxes."""
     out = out.float()
     logit = out[:, 0]
     p = torch.sigmoid(logit)

@@ -5,13 +5,12 @@ from app.lifting.resection import rotation_exponential
 from evaluation.metrics import (
     Floats,
     align,
-    correct_keypoints,
     rigid_error_mm,
     root_centred_error_mm,
     similarity_error_mm,
     summarise,
-    torso_px,
 )
+from models.pck import correct_keypoints, torso_px
 
 RNG = np.random.default_rng(4)
 TRUTH = RNG.normal(size=(30, 14, 3)) * 400

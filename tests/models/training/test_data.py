@@ -1,0 +1,95 @@
+"""What needs no torch: reading data sets, holding photos out, random views."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from library_store.skeleton import LSP14
+from models.training.augment import MIRROR, canonical, crop_matrix, random_view
+from models.training.dataset import LabelledCrop, held_out, load
+from models.training.scenes import mosaic
+
+
+def labelled_crop(group: int = 0) -> LabelledCrop:
+    rng = np.random.default_rng(group)
+    return LabelledCrop(
+        name="x",
+        group=group,
+        image=rng.integers(0, 256, (120, 120, 3)).astype(np.uint8),
+        joints_px=rng.uniform(30, 90, (14, 2)).astype(np.float32),
+        weight=np.ones(14, np.float32),
+        visible=np.ones(14, np.float32),
+        wild=True,
+    )
+
+
+def test_labels_are_read_and_hardly_labelled_crops_left_out(tmp_path: Path) -> None:
+    joints = np.arange(28.0).reshape(14, 2).tolist()
+    records = [
+        {"image": "a.jpg", "joints_px": joints, "labelled": [1] * 13 + [0]},
+        {"image": "b.jpg", "joints_px": joints, "labelled": [1] * 3 + [0] * 11},
+    ]
+    for record in records:
+        cv2.imwrite(str(tmp_path / str(record["image"])), np.zeros((32, 32, 3), np.uint8))
+    (tmp_path / "annotations.json").write_text(json.dumps({"images": records}))
+    crops = load(tmp_path)
+    assert [c.name for c in crops] == ["a.jpg"]
+    np.testing.assert_allclose(crops[0].joints_px, joints)
+    assert crops[0].weight[-1] == 0
+
+
+def test_a_photo_is_held_out_whole_and_always_the_same_ones() -> None:
+    kept = [held_out(labelled_crop(group)) for group in range(700)]
+    assert 60 < sum(kept) < 140
+    assert kept == [held_out(labelled_crop(group)) for group in range(700)]
+
+
+def test_a_mirrored_crop_exchanges_left_and_right() -> None:
+    crop = labelled_crop()
+    center, extent = crop.extent_px
+    plain = crop_matrix(center, extent, 0.0, 96)
+    mirrored = crop_matrix(center, extent, 0.0, 96, flip=True)
+    x = crop.joints_px @ plain[:, :2].T + plain[:, 2]
+    flipped = crop.joints_px @ mirrored[:, :2].T + mirrored[:, 2]
+    np.testing.assert_allclose(flipped[:, 0], 95 - x[:, 0], atol=1e-3)
+    assert [LSP14.joint_names[i][2:] for i in MIRROR[2:]] == [n[2:] for n in LSP14.joint_names[2:]]
+
+
+def test_a_view_is_its_seed_s_and_leaves_the_crop_alone() -> None:
+    crop, other = labelled_crop(1), labelled_crop(2)
+    before = crop.image.copy()
+    a, b = (random_view(crop, other, 64, np.random.default_rng(5)) for _ in range(2))
+    np.testing.assert_array_equal(a.image, b.image)
+    np.testing.assert_array_equal(a.joints_px, b.joints_px)
+    np.testing.assert_array_equal(crop.image, before)
+
+
+def test_joints_outside_a_view_are_absent_and_not_learned_as_places() -> None:
+    crop = labelled_crop(1)
+    for seed in range(60):
+        view = random_view(crop, crop, 64, np.random.default_rng(seed))
+        outside = ((view.joints_px < -0.5) | (view.joints_px > 63.5)).any(1)
+        assert (view.weight[outside] == 0).all()
+        assert (view.presence[outside] == 0).all()
+        assert (view.weight[~outside] > 0).all()
+
+
+def test_the_canonical_view_holds_every_joint() -> None:
+    view = canonical(labelled_crop(3), 96)
+    assert (view.presence == 1).all()
+    low, high = view.joints_px.min(0), view.joints_px.max(0)
+    np.testing.assert_allclose((low + high) / 2, 47.5, atol=0.01)
+    np.testing.assert_allclose((high - low).max(), 96 / 1.25, atol=0.01)
+
+
+def test_mosaic_boxes_lie_in_the_picture() -> None:
+    crops = [labelled_crop(i) for i in range(5)]
+    back = [np.full((90, 120, 3), 90, np.uint8)]
+    for seed in range(40):
+        scene = mosaic(crops, back, (160, 96), np.random.default_rng(seed))
+        assert scene.image.shape == (96, 160, 3)
+        assert (scene.boxes >= 0).all()
+        assert (scene.boxes <= (159, 95, 159, 95)).all()
+        assert scene.trust.shape == (12, 20)
