@@ -97,7 +97,7 @@ def random_view(
     if rng.random() < 0.12:  # cut off at a random side
         scale *= rng.uniform(0.55, 0.9)
         offset = rng.uniform(-0.3, 0.3, 2)
-    if rng.random() < (0.35 if crop.wild else 0.15):
+    if rng.random() < (0.25 if crop.wild else 0.08):
         angle = rng.uniform(-np.pi, np.pi)
     else:
         angle = float(np.deg2rad(np.clip(rng.normal(0, 25), -70, 70)))

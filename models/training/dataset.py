@@ -18,7 +18,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from library_store.skeleton import HEAD_TOP, LSP14, NECK
+from library_store.skeleton import (
+    HEAD_TOP,
+    L_HIP,
+    L_SHOULDER,
+    LSP14,
+    NECK,
+    R_HIP,
+    R_SHOULDER,
+)
 
 MP33_LIMBS = (12, 14, 16, 11, 13, 15, 24, 26, 28, 23, 25, 27)
 """The teacher's landmarks for joints 2..13 of lsp14, in that order."""
@@ -93,6 +101,26 @@ def _from_labels(record: dict[str, Any], image: Image, group: int) -> LabelledCr
     )
 
 
+def _trust(
+    joints_px: NDArray[np.float32], second_px: NDArray[np.float32], agreement: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """How far the first teacher's limbs (joints 2..13) are believed, (12,).
+
+    The teachers err independently: agreement is the best sign that a label is right. Where they
+    differ about the side only, the landmark network is right far more often than the small CPM.
+    """
+    torso = max(
+        float(np.linalg.norm(joints_px[R_SHOULDER] - joints_px[L_HIP])),
+        float(np.linalg.norm(joints_px[L_SHOULDER] - joints_px[R_HIP])),
+        1.0,
+    )
+    other_side = second_px[list(LSP14.mirror)]
+    side_only = np.linalg.norm(joints_px - other_side, axis=1)[2:] < 0.25 * torso
+    trust = np.where(agreement < 0.6, 0.6, 0.35)
+    trust = np.where(side_only, 0.8, trust)
+    return np.where(agreement < 0.25, 1.0, trust).astype(np.float32)
+
+
 def _from_teachers(record: dict[str, Any], image: Image) -> LabelledCrop | None:
     landmarks = np.asarray(record["mp33_px"], np.float32)
     visibility = np.asarray(record["mp_visibility"], np.float32)[list(MP33_LIMBS)]
@@ -101,8 +129,7 @@ def _from_teachers(record: dict[str, Any], image: Image) -> LabelledCrop | None:
     weight = np.zeros(LSP14.n_joints, np.float32)
     visible = np.zeros(LSP14.n_joints, np.float32)
     joints[2:] = landmarks[list(MP33_LIMBS)]
-    # The two teachers err independently: agreement is the best sign that a label is right.
-    trust = np.where(agreement < 0.25, 1.0, np.where(agreement < 0.6, 0.4, 0.2))
+    trust = _trust(joints, np.asarray(record["cpm14_px"], np.float32), agreement)
     weight[2:] = np.clip(visibility, 0.25, 1.0) * trust
     visible[2:] = ((visibility > 0.5) & (agreement < 0.25)).astype(np.float32)
     confidence = np.asarray(record["cpm_confidence"], np.float32)
