@@ -1,25 +1,23 @@
-"""The ``posematch`` command: serve, library build|info|verify|import, predict, version."""
+"""The ``posematch`` command: serve, predict, version; others are in :mod:`app.commands`."""
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 import cv2
 import typer
 import uvicorn
-from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from app.answers import poses_answer
+from app.commands import library
+from app.commands.console import build_if_missing, notices, output
 from app.drawing import draw_result
-from app.engine import load_engine, locate_library
+from app.engine import load_engine
 from app.errors import PoseMatchError, RequestError, StartupError
 from app.imaging import decode_photo
 from app.lifting.types import Method
@@ -27,18 +25,10 @@ from app.main import create_app
 from app.observability import configure_logging
 from app.pipeline import PhotoQuery
 from app.schemas import Person, PosesAnswer
-from app.settings import Settings, load_settings
+from app.settings import load_settings
 from app.version import VERSION
-from library_store.build import (
-    BuildSettings,
-    build_library,
-    describe_library,
-    verify_library,
-)
 from library_store.errors import LibraryError
-from library_store.importers import Clip, MocapError, read_all, write_npz
-from library_store.manifest import Manifest
-from library_store.prior import DEFAULT_PRIOR, PosePrior
+from library_store.importers import MocapError
 
 cli = typer.Typer(
     help="Photo in, 3D human pose out. Settings are environment variables, POSEMATCH_*.",
@@ -46,11 +36,7 @@ cli = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-library_cli = typer.Typer(help="The exemplar library.", no_args_is_help=True)
-cli.add_typer(library_cli, name="library")
-
-output = Console()
-notices = Console(stderr=True)
+cli.add_typer(library.commands, name="library")
 
 
 def main() -> None:
@@ -68,26 +54,6 @@ def main() -> None:
         sys.exit(1)
 
 
-@contextmanager
-def stage_progress() -> Iterator[Callable[[str, float], None]]:
-    """A bar per stage on stderr; yields the callback that stages report their fraction to."""
-    columns = (TextColumn("{task.description:>24}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=notices) as bars:
-        tasks: dict[str, TaskID] = {}
-
-        def report(stage: str, fraction: float) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=1.0)
-            bars.update(tasks[stage], completed=fraction)
-
-        yield report
-
-
-def _build_if_missing(settings: Settings) -> Path:
-    with stage_progress() as report:
-        return locate_library(settings, report)
-
-
 @cli.command()
 def serve(
     host: Annotated[str | None, typer.Option(help="Address; default POSEMATCH_HOST.")] = None,
@@ -96,7 +62,7 @@ def serve(
     """Build the default library if it is not cached, and serve."""
     given = {"host": host, "port": port}
     settings = load_settings(**{name: value for name, value in given.items() if value is not None})
-    _build_if_missing(settings)
+    build_if_missing(settings)
     configure_logging(settings.log_level)
 
     def stop(_: StartupError) -> None:
@@ -139,7 +105,7 @@ def predict(
         raise typer.BadParameter("fusion or paper", param_hint="--method")
     chosen: Method = "paper" if method == "paper" else "fusion"
     settings = load_settings()
-    _build_if_missing(settings)
+    build_if_missing(settings)
     engine = load_engine(settings)
     data = photo.read_bytes()
     query = PhotoQuery(max_people=max_people, method=chosen, mirrored=mirrored)
@@ -185,88 +151,3 @@ def _person_table(number: int, person: Person) -> Table:
 def print_version() -> None:
     """Print the version."""
     output.print(VERSION, highlight=False)
-
-
-@library_cli.command("build")
-def build(
-    directory: Annotated[
-        Path | None,
-        typer.Option(help="Build here; default POSEMATCH_LIBRARY_DIR, else the cache."),
-    ] = None,
-    poses: Annotated[int, typer.Option(min=1, help="How many poses to sample.")] = 200_000,
-    seed: Annotated[int, typer.Option(help="Another seed gives other poses.")] = 0,
-) -> None:
-    """Sample a library from the pose prior; in the cache, only if it is not there yet."""
-    settings = load_settings()
-    directory = directory or settings.library_dir
-    if directory is None:
-        if (poses, seed) != (200_000, 0):
-            raise typer.BadParameter("a library of your own needs --directory")
-        directory = _build_if_missing(settings)
-    else:
-        try:
-            wanted = BuildSettings(name=directory.name, n_poses=poses, seed=seed)
-        except ValueError as error:
-            raise typer.BadParameter(str(error), param_hint="--directory") from error
-        with stage_progress() as report:
-            build_library(directory, PosePrior.load(DEFAULT_PRIOR), wanted, report)
-    output.print(str(directory), highlight=False, soft_wrap=True)
-
-
-@library_cli.command("info")
-def print_info() -> None:
-    """Print the manifest of the library that is served."""
-    settings = load_settings()
-    _print_manifest(describe_library(_build_if_missing(settings)))
-
-
-@library_cli.command("verify")
-def verify() -> None:
-    """Check every file of the library that is served against its SHA-256."""
-    settings = load_settings()
-    directory = _build_if_missing(settings)
-    verify_library(directory)
-    output.print(f"{directory}: whole", highlight=False)
-
-
-@library_cli.command("import")
-def import_mocap(
-    paths: Annotated[
-        list[Path], typer.Argument(exists=True, help="AMC (with its ASF), BVH, npz, or folders.")
-    ],
-    out: Annotated[Path, typer.Option(help="Write the clips here, as one npz file.")],
-    mapping: Annotated[
-        Path | None,
-        typer.Option(exists=True, dir_okay=False, help="JSON: lsp14 joint to BVH joint."),
-    ] = None,
-    fps: Annotated[float, typer.Option(min=0.1, help="Keep at least so many poses a second.")] = 30,
-    strict: Annotated[bool, typer.Option(help="Refuse all if one file cannot be read.")] = False,
-) -> None:
-    """Read motion capture files as 14-joint poses in mm, Y up, and say what was noticed."""
-    if out.suffix.lower() != ".npz":
-        raise typer.BadParameter("must end in .npz", param_hint="--out")
-    clips, skipped = read_all(paths, mapping=mapping, strict=strict)
-    for error in skipped:
-        notices.print(
-            f"[yellow]skipped:[/yellow] {escape(str(error))}", highlight=False, soft_wrap=True
-        )
-    kept = [clip.thinned(fps) for clip in clips]
-    write_npz(out, kept)
-    output.print(_clips_table(kept))
-    poses = sum(len(clip) for clip in kept)
-    total = f"{len(kept)} clips, {poses} poses; {len(skipped)} files skipped"
-    output.print(f"{out}: {total}", highlight=False, markup=False, soft_wrap=True)
-
-
-def _clips_table(clips: list[Clip]) -> Table:
-    table = Table()
-    for heading in ("clip", "subject", "action", "poses", "noticed"):
-        table.add_column(heading, justify="right" if heading == "poses" else "left")
-    for clip in clips:
-        said = (clip.name, clip.subject, clip.action, str(len(clip)), "; ".join(clip.findings))
-        table.add_row(*map(escape, said))
-    return table
-
-
-def _print_manifest(manifest: Manifest) -> None:
-    output.print_json(json.dumps(json.loads(manifest.to_json())))

@@ -1,0 +1,1 @@
+"""The sub-commands of ``posematch``, one module a topic, and the console they share."""

@@ -1,0 +1,37 @@
+"""What all commands print with: results on stdout, notices and progress bars on stderr."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from app.engine import locate_library
+from app.settings import Settings
+
+output = Console()
+notices = Console(stderr=True)
+
+
+@contextmanager
+def stage_progress() -> Iterator[Callable[[str, float], None]]:
+    """A bar per stage on stderr; yields the callback that stages report their fraction to."""
+    columns = (TextColumn("{task.description:>24}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=notices) as bars:
+        tasks: dict[str, TaskID] = {}
+
+        def report(stage: str, fraction: float) -> None:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(stage, total=1.0)
+            bars.update(tasks[stage], completed=fraction)
+
+        yield report
+
+
+def build_if_missing(settings: Settings) -> Path:
+    """The directory of the library to serve, the default one built first when it is missing."""
+    with stage_progress() as report:
+        return locate_library(settings, report)
