@@ -152,6 +152,15 @@ def _from_teachers(record: dict[str, Any], image: Image) -> LabelledCrop | None:
     )
 
 
+def read_annotations(path: Path) -> list[dict[str, Any]]:
+    """The records of a folder's or tar's ``annotations.json``, without the images."""
+    for name, data in _members(path):
+        if name == "annotations.json":
+            records: list[dict[str, Any]] = json.loads(data)["images"]
+            return records
+    raise FileNotFoundError(f"{path} has no annotations.json")
+
+
 def load(path: Path) -> list[LabelledCrop]:
     """Read every usable crop of a folder or tar; crops with hardly any label are left out."""
     images: dict[str, bytes] = {}
@@ -173,6 +182,11 @@ def load(path: Path) -> list[LabelledCrop]:
     return crops
 
 
+def in_held_out_group(group: int) -> bool:
+    """Whether a photo, by its number, is held out."""
+    return (group * 2654435761 % 2**32) % HOLD_OUT_ONE_IN == 0
+
+
 def held_out(crop: LabelledCrop) -> bool:
     """Whether the photo that a crop was cut from is held out (whole photos at a time)."""
-    return (crop.group * 2654435761 % 2**32) % HOLD_OUT_ONE_IN == 0
+    return in_held_out_group(crop.group)
