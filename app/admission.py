@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from app.errors import OverloadedError, PoseMatchError
 
@@ -58,6 +58,7 @@ class Admission:
         self._queue_size = queue_size
         self._deadline_s = deadline_s
         self._waiting: deque[_Waiter] = deque()
+        self._ends_s: dict[Future[Any], float] = {}
         self._mean_s: dict[str, float] = {}
 
     @property
@@ -73,6 +74,11 @@ class Admission:
     def expect(self, kind: str, seconds: float) -> None:
         """Start the running mean of ``kind`` of work at ``seconds`` (a warm-up's figure)."""
         self._mean_s[kind] = seconds
+
+    def check(self, kind: str) -> None:
+        """Raise the ``OverloadedError`` that a request whose body came now would meet, if any."""
+        if not self._free:
+            self._refuse_if_hopeless(self._mean_s.get(kind, 0.0), time.monotonic())
 
     async def run(self, kind: str, work: Callable[[], T], arrival: Arrival, *, units: int = 1) -> T:
         """Run ``work`` on a worker thread and return its result.
@@ -90,10 +96,11 @@ class Admission:
             self._release()
             raise
         loop = asyncio.get_running_loop()
+        self._ends_s[thread] = started_s + units * self._mean_s.get(kind, 0.0)
 
         def ended(_: Future[T]) -> None:
             if not loop.is_closed():
-                loop.call_soon_threadsafe(self._end, kind, started_s, units)
+                loop.call_soon_threadsafe(self._end, thread, kind, started_s, units)
 
         thread.add_done_callback(ended)
         return await asyncio.wrap_future(thread)
@@ -108,13 +115,7 @@ class Admission:
         if self._free:
             self._free -= 1
             return
-        backlog_s = sum(waiter.cost_s for waiter in self._waiting)
-        wait_s = (backlog_s + unit_s) / self._workers
-        slack_s = arrival.at_s + self._deadline_s - unit_s - time.monotonic()
-        if len(self._waiting) >= self._queue_size:
-            raise self._refusal("queue_full", wait_s)
-        if wait_s > slack_s:
-            raise self._refusal("deadline", wait_s)
+        wait_s, slack_s = self._refuse_if_hopeless(unit_s, arrival.at_s)
         waiter = _Waiter(asyncio.get_running_loop().create_future(), units * unit_s)
         self._waiting.append(waiter)
         try:
@@ -133,6 +134,19 @@ class Admission:
             self._leave(waiter)
             raise self._refusal("deadline", wait_s)
 
+    def _refuse_if_hopeless(self, unit_s: float, at_s: float) -> tuple[float, float]:
+        """How long one more request would wait, and how long it may; or ``OverloadedError``."""
+        now_s = time.monotonic()
+        backlog_s = sum(waiter.cost_s for waiter in self._waiting)
+        backlog_s += sum(max(0.0, end_s - now_s) for end_s in self._ends_s.values())
+        wait_s = backlog_s / self._workers
+        slack_s = at_s + self._deadline_s - unit_s - now_s
+        if len(self._waiting) >= self._queue_size:
+            raise self._refusal("queue_full", wait_s)
+        if wait_s > slack_s:
+            raise self._refusal("deadline", wait_s)
+        return wait_s, slack_s
+
     def _leave(self, waiter: _Waiter) -> None:
         """Give up a place in the queue, or the permit that was granted meanwhile."""
         if waiter.turn.done():
@@ -140,7 +154,8 @@ class Admission:
         else:
             self._waiting.remove(waiter)
 
-    def _end(self, kind: str, started_s: float, units: int) -> None:
+    def _end(self, thread: Future[Any], kind: str, started_s: float, units: int) -> None:
+        del self._ends_s[thread]
         spent_s = (time.monotonic() - started_s) / units
         mean_s = self._mean_s.get(kind, spent_s)
         self._mean_s[kind] = mean_s + _MEMORY * (spent_s - mean_s)

@@ -16,6 +16,7 @@ from rich.table import Table
 from app.answers import poses_answer
 from app.commands import library
 from app.commands.console import build_if_missing, notices, output
+from app.connection import connection_class
 from app.drawing import draw_result
 from app.engine import load_engine
 from app.errors import PoseMatchError, RequestError, StartupError
@@ -74,6 +75,7 @@ def serve(
             app,
             host=settings.host,
             port=settings.port,
+            http=connection_class(settings.upload_timeout_s),
             lifespan="on",
             ws="none",
             access_log=False,

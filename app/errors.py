@@ -206,7 +206,7 @@ class OverloadedError(RequestError):
 
     status = 503
     slug = "overloaded"
-    title = "OverloadedError"
+    title = "At capacity"
 
     def __init__(self, reason: str, retry_after_s: int) -> None:
         super().__init__(

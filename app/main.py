@@ -7,6 +7,7 @@ The socket listens while the engine loads, so that /livez and /readyz answer; ev
 from __future__ import annotations
 
 import asyncio
+import gc
 import json
 import logging
 import signal
@@ -24,6 +25,7 @@ from starlette.middleware.cors import CORSMiddleware
 from app import schemas
 from app.api import exemplars, health, info, lift, metrics, poses, problems
 from app.api.deps import Service
+from app.api.shedding import SheddingMiddleware
 from app.engine import load_engine
 from app.errors import StartupError
 from app.observability import RequestContextMiddleware
@@ -86,6 +88,9 @@ def create_app(
             model=f"{engine.card.name} {engine.card.version}",
             library=f"{manifest.name} {manifest.version}",
         )
+        # What was loaded stays: let the collector not walk over it again and again.
+        gc.collect()
+        gc.freeze()
         service.admission.expect("poses", engine.photo_s)
         service.engine = engine
         logger.info("ready", extra={"exemplars": len(engine.library)})
@@ -113,6 +118,7 @@ def create_app(
                 expose_headers=["X-Request-ID", "Server-Timing", "Retry-After"],
             )
         )
+    middleware.append(Middleware(SheddingMiddleware, service=service))
     app = FastAPI(
         title="posematch",
         version=VERSION,

@@ -8,7 +8,7 @@ import re
 import sys
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info
@@ -17,7 +17,6 @@ from prometheus_client.process_collector import ProcessCollector
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.admission import Admission
 from app.errors import PROBLEM_TYPE_PREFIX
 
 logger = logging.getLogger("posematch")
@@ -80,14 +79,24 @@ class Metrics:
         self._waiting = Gauge(
             "posematch_waiting", "Requests waiting for a worker", registry=self.registry
         )
+        self._upload_bytes = Gauge(
+            "posematch_upload_bytes", "Bytes of the bodies held in memory", registry=self.registry
+        )
         self._build = Info("posematch", "What is being served", registry=self.registry)
         ProcessCollector(registry=self.registry)
         PlatformCollector(registry=self.registry)
 
-    def watch(self, admission: Admission) -> None:
-        """Read the gauges from ``admission`` whenever the metrics are scraped."""
-        self._running.set_function(lambda: admission.running)
-        self._waiting.set_function(lambda: admission.waiting)
+    def watch(
+        self,
+        *,
+        running: Callable[[], float],
+        waiting: Callable[[], float],
+        upload_bytes: Callable[[], float],
+    ) -> None:
+        """Read the gauges from these functions whenever the metrics are scraped."""
+        self._running.set_function(running)
+        self._waiting.set_function(waiting)
+        self._upload_bytes.set_function(upload_bytes)
 
     def describe(self, **labels: str) -> None:
         """State which version, model and library are served."""
@@ -146,7 +155,7 @@ class RequestContextMiddleware:
             self._record(scope, status, time.perf_counter() - started_s, request_id)
 
     def _record(self, scope: Scope, status: int, spent_s: float, request_id: str) -> None:
-        route = getattr(scope.get("route"), "path", "unmatched")
+        route = scope["state"].get("route") or getattr(scope.get("route"), "path", "unmatched")
         method = scope["method"] if scope["method"] in _METHODS else "other"
         self._metrics.requests.labels(route, method, str(status or 499)).inc()
         self._metrics.request_seconds.labels(route).observe(spent_s)

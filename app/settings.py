@@ -64,10 +64,19 @@ class Settings(BaseSettings):
         description="Most pixels of an image, read from its header before anything is decoded.",
     )
     upload_timeout_s: float = Field(
-        30.0, gt=0, le=3600, description="Longest time a body may take to arrive, else 408."
+        30.0,
+        gt=0,
+        le=3600,
+        description="Longest time a request's head or its body may take to arrive, else 408; also "
+        "how long a client may leave its answer unread.",
+    )
+    upload_memory_bytes: int = Field(
+        128_000_000,
+        ge=1_000,
+        description="Bytes of all bodies held in memory at once; what goes beyond gets a 503.",
     )
     decode_side_px: int = Field(
-        1280,
+        1000,
         ge=256,
         le=16384,
         description="Photos are decoded at a reduced scale (1/2, 1/4, 1/8; JPEG only) as long as "
@@ -154,6 +163,8 @@ class Settings(BaseSettings):
             raise ValueError("quota_per_minute counts per API key: set api_keys too")
         if self.max_batch_body_bytes < self.max_body_bytes:
             raise ValueError("max_batch_body_bytes is smaller than max_body_bytes")
+        if self.upload_memory_bytes < self.max_batch_body_bytes:
+            raise ValueError("upload_memory_bytes is smaller than max_batch_body_bytes")
         return self
 
 

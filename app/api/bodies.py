@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,6 +20,7 @@ from app.errors import (
     EmptyBodyError,
     InvalidInputError,
     MalformedBodyError,
+    OverloadedError,
     UploadTooSlowError,
 )
 
@@ -36,8 +39,43 @@ class Part:
     data: bytes
 
 
-async def read_body(request: Request, *, limit_bytes: int, timeout_s: float) -> bytes:
-    """The whole body.
+class UploadMemory:
+    """Bounds the bytes of all bodies held at once, so that many uploads cannot exhaust memory."""
+
+    def __init__(self, limit_bytes: int) -> None:
+        self._limit_bytes = limit_bytes
+        self._held_bytes = 0
+
+    @property
+    def held_bytes(self) -> int:
+        """Bytes of the bodies being received, waiting or computed."""
+        return self._held_bytes
+
+    @contextmanager
+    def share(self) -> Iterator[Callable[[int], None]]:
+        """For one request: a function to call with the size of each piece before it is kept.
+
+        It raises ``OverloadedError`` when there is no room. Everything is given back at the end.
+        """
+        mine = 0
+
+        def take(size: int) -> None:
+            nonlocal mine
+            if self._held_bytes + size > self._limit_bytes:
+                raise OverloadedError("upload_memory", 1)
+            self._held_bytes += size
+            mine += size
+
+        try:
+            yield take
+        finally:
+            self._held_bytes -= mine
+
+
+async def read_body(
+    request: Request, *, limit_bytes: int, timeout_s: float, take: Callable[[int], None]
+) -> bytes:
+    """The whole body; ``take`` is asked for every piece of it (see ``UploadMemory``).
 
     Raises ``BodyTooLargeError`` as soon as the stated or the counted length passes the limit,
     ``UploadTooSlowError`` when it is not complete in time, ``EmptyBodyError``, or
@@ -60,6 +98,7 @@ async def read_body(request: Request, *, limit_bytes: int, timeout_s: float) -> 
                 size += len(chunk)
                 if size > limit_bytes:
                     raise BodyTooLargeError(limit_bytes)
+                take(len(chunk))
                 chunks.append(chunk)
     except TimeoutError:
         raise UploadTooSlowError(f"the body was not complete after {timeout_s:g} s") from None

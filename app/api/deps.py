@@ -10,6 +10,7 @@ from typing import Annotated
 from fastapi import Depends, Request
 
 from app.admission import Admission
+from app.api.bodies import UploadMemory
 from app.engine import Engine
 from app.errors import NotReadyError, QuotaExceededError, StartupError, UnauthorizedError
 from app.observability import Metrics
@@ -28,6 +29,7 @@ class Service:
     settings: Settings
     metrics: Metrics = field(default_factory=Metrics)
     admission: Admission = field(init=False)
+    uploads: UploadMemory = field(init=False)
     quota: Quota | None = None
     engine: Engine | None = None
     stopping: bool = False
@@ -41,13 +43,18 @@ class Service:
             queue_size=settings.queue_size,
             deadline_s=settings.deadline_ms / 1e3,
         )
-        self.metrics.watch(self.admission)
+        self.uploads = UploadMemory(settings.upload_memory_bytes)
+        self.metrics.watch(
+            running=lambda: self.admission.running,
+            waiting=lambda: self.admission.waiting,
+            upload_bytes=lambda: self.uploads.held_bytes,
+        )
         self.key_digests = tuple(_digest(key.get_secret_value()) for key in settings.api_keys)
         if settings.quota_per_minute is not None:
             self.quota = Quota(self.key_digests, settings.quota_per_minute)
 
 
-def get_service(request: Request) -> Service:
+async def get_service(request: Request) -> Service:
     """The application's state."""
     service: Service = request.app.state.service
     return service
@@ -56,7 +63,7 @@ def get_service(request: Request) -> Service:
 ServiceDep = Annotated[Service, Depends(get_service)]
 
 
-def authorise(request: Request, service: ServiceDep) -> None:
+async def authorise(request: Request, service: ServiceDep) -> None:
     """Check the API key and its quota, when keys are on.
 
     Every key is compared, by digests of equal length, so that the time taken tells nothing.
@@ -76,7 +83,7 @@ def authorise(request: Request, service: ServiceDep) -> None:
             raise QuotaExceededError(retry_after_s)
 
 
-def get_engine(service: ServiceDep) -> Engine:
+async def get_engine(service: ServiceDep) -> Engine:
     """The loaded engine; ``NotReadyError`` until there is one, and while shutting down."""
     if service.stopping:
         raise NotReadyError("the service is shutting down")

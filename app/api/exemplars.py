@@ -19,7 +19,7 @@ router = APIRouter(tags=["exemplars"], dependencies=[Depends(authorise)])
     response_class=Response,
     responses=describe_ok(schemas.ExemplarAnswer, "The exemplar.") | describe(401, 404, 429, 503),
 )
-def get_exemplar(exemplar_id: str, engine: EngineDep) -> Response:
+async def get_exemplar(exemplar_id: str, engine: EngineDep) -> Response:
     """The pose is in the exemplar's own frame: root-centred, Y up, millimetres."""
     try:
         answer = exemplar_answer(engine.library, exemplar_id)

@@ -40,25 +40,27 @@ MAX_LIFT_BODY_BYTES = 2_000_000
 )
 async def lift_people(request: Request, service: ServiceDep, engine: EngineDep) -> Response:
     """Joints left out or with confidence 0 are missing; up to 256 people a call."""
-    body = await read_body(
-        request,
-        limit_bytes=min(MAX_LIFT_BODY_BYTES, service.settings.max_body_bytes),
-        timeout_s=service.settings.upload_timeout_s,
-    )
     request_id = request.state.request_id
-    with WatchedArrival(request.receive) as arrival:
+    with service.uploads.share() as take:
+        body = await read_body(
+            request,
+            limit_bytes=min(MAX_LIFT_BODY_BYTES, service.settings.max_body_bytes),
+            timeout_s=service.settings.upload_timeout_s,
+            take=take,
+        )
+        with WatchedArrival(request.receive) as arrival:
 
-        def work() -> tuple[schemas.LiftAnswer, bytes]:
-            wait_ms = 1e3 * (time.monotonic() - arrival.at_s)
-            wanted = parse_lift_request(body)
-            result = engine.pipeline.lift(query_of(wanted))
-            answer = lift_answer(engine, result, wanted.method, request_id)
-            total_ms = 1e3 * (time.monotonic() - arrival.at_s)
-            timings_ms = {"wait": wait_ms} | answer.timings_ms | {"total": total_ms}
-            answer = answer.model_copy(update={"timings_ms": rounded_timings(timings_ms)})
-            return answer, answer.model_dump_json().encode()
+            def work() -> tuple[schemas.LiftAnswer, bytes]:
+                wait_ms = 1e3 * (time.monotonic() - arrival.at_s)
+                wanted = parse_lift_request(body)
+                result = engine.pipeline.lift(query_of(wanted))
+                answer = lift_answer(engine, result, wanted.method, request_id)
+                total_ms = 1e3 * (time.monotonic() - arrival.at_s)
+                timings_ms = {"wait": wait_ms} | answer.timings_ms | {"total": total_ms}
+                answer = answer.model_copy(update={"timings_ms": rounded_timings(timings_ms)})
+                return answer, answer.model_dump_json().encode()
 
-        answer, encoded = await service.admission.run("lift", work, arrival)
+            answer, encoded = await service.admission.run("lift", work, arrival)
     request.state.timings_ms.update(answer.timings_ms)
     return Response(encoded, media_type="application/json")
 

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import Field, ValidationInfo, field_validator
 
 from app import schemas
-from app.admission import Arrival
+from app.admission import Arrival, ClientGoneError
 from app.answers import poses_answer, rounded_timings
-from app.api.bodies import WatchedArrival, image_parts, is_multipart, photo_bytes, read_body
+from app.api.bodies import (
+    Part,
+    WatchedArrival,
+    image_parts,
+    is_multipart,
+    photo_bytes,
+    read_body,
+)
 from app.api.deps import EngineDep, Service, ServiceDep, authorise
 from app.api.problems import describe, describe_ok, problem_of
 from app.engine import Engine
@@ -139,22 +146,26 @@ async def estimate_poses(
     top-left pixel. Millimetres are in the camera frame: x right, y down, z forward.
     """
     limits = service.settings
-    body = await read_body(
-        request, limit_bytes=limits.max_body_bytes, timeout_s=limits.upload_timeout_s
-    )
     content_type = request.headers.get("content-type")
-    with WatchedArrival(request.receive) as arrival:
-        answer, encoded = await service.admission.run(
-            "poses",
-            _work(
-                engine,
-                lambda: photo_bytes(body, content_type),
-                parameters.query(),
-                request.state.request_id,
-                arrival,
-            ),
-            arrival,
+    with service.uploads.share() as take:
+        body = await read_body(
+            request,
+            limit_bytes=limits.max_body_bytes,
+            timeout_s=limits.upload_timeout_s,
+            take=take,
         )
+        with WatchedArrival(request.receive) as arrival:
+            answer, encoded = await service.admission.run(
+                "poses",
+                _work(
+                    engine,
+                    lambda: photo_bytes(body, content_type),
+                    parameters.query(),
+                    request.state.request_id,
+                    arrival,
+                ),
+                arrival,
+            )
     request.state.timings_ms.update(answer.timings_ms)
     _observe(service, answer)
     return Response(encoded, media_type="application/json")
@@ -213,41 +224,65 @@ async def estimate_batch(
     A photo that cannot be answered has a `problem` in its place; the others are answered.
     """
     limits = service.settings
-    body = await read_body(
-        request, limit_bytes=limits.max_batch_body_bytes, timeout_s=limits.upload_timeout_s
-    )
     content_type = request.headers.get("content-type")
     if not is_multipart(content_type):
         raise MalformedBodyError("a batch is a multipart form, its field 'image' once per photo")
-    images = await asyncio.to_thread(image_parts, body, content_type)
-    if len(images) > limits.max_batch_images:
-        raise InvalidInputError([("image", f"more than {limits.max_batch_images} images")])
-    request_id = request.state.request_id
-    query = parameters.query()
-
-    with WatchedArrival(request.receive) as arrival:
-
-        def work() -> tuple[list[schemas.PosesAnswer], bytes]:
-            items = []
-            for position, image in enumerate(images):
-                name = image.filename or str(position)
-                photo = _one_photo(image.data, limits.max_body_bytes)
-                try:
-                    answer, _ = _work(
-                        engine, photo, query, request_id, Arrival(time.monotonic(), arrival.gone)
-                    )()
-                    items.append(schemas.BatchItem(name=name, answer=answer, problem=None))
-                except RequestError as error:
-                    problem = problem_of(error, request_id)
-                    items.append(schemas.BatchItem(name=name, answer=None, problem=problem))
-            answers = [item.answer for item in items if item.answer is not None]
-            batch = schemas.BatchAnswer(request_id=request_id, images=tuple(items))
-            return answers, batch.model_dump_json().encode()
-
-        answers, encoded = await service.admission.run("poses", work, arrival, units=len(images))
+    with service.uploads.share() as take:
+        body = await read_body(
+            request,
+            limit_bytes=limits.max_batch_body_bytes,
+            timeout_s=limits.upload_timeout_s,
+            take=take,
+        )
+        images = await asyncio.to_thread(image_parts, body, content_type)
+        if len(images) > limits.max_batch_images:
+            raise InvalidInputError([("image", f"more than {limits.max_batch_images} images")])
+        with WatchedArrival(request.receive) as arrival:
+            work = _batch_work(
+                engine,
+                images,
+                parameters.query(),
+                request.state.request_id,
+                arrival,
+                limits.max_body_bytes,
+            )
+            answers, encoded = await service.admission.run(
+                "poses", work, arrival, units=len(images)
+            )
     for answer in answers:
         _observe(service, answer)
     return Response(encoded, media_type="application/json")
+
+
+def _batch_work(
+    engine: Engine,
+    images: Sequence[Part],
+    query: PhotoQuery,
+    request_id: str,
+    arrival: Arrival,
+    limit_bytes: int,
+) -> Callable[[], tuple[list[schemas.PosesAnswer], bytes]]:
+    """The computation of all photos of a batch up to its JSON, to be run on a worker thread."""
+
+    def work() -> tuple[list[schemas.PosesAnswer], bytes]:
+        items = []
+        for position, image in enumerate(images):
+            if arrival.gone.done():
+                raise ClientGoneError
+            name = image.filename or str(position)
+            photo = _one_photo(image.data, limit_bytes)
+            own = Arrival(time.monotonic(), arrival.gone)
+            try:
+                answer, _ = _work(engine, photo, query, request_id, own)()
+                items.append(schemas.BatchItem(name=name, answer=answer, problem=None))
+            except RequestError as error:
+                problem = problem_of(error, request_id)
+                items.append(schemas.BatchItem(name=name, answer=None, problem=problem))
+        answers = [item.answer for item in items if item.answer is not None]
+        batch = schemas.BatchAnswer(request_id=request_id, images=tuple(items))
+        return answers, batch.model_dump_json().encode()
+
+    return work
 
 
 def _one_photo(data: bytes, limit_bytes: int) -> Callable[[], bytes]:

@@ -36,6 +36,12 @@ def problem_of(error: RequestError, request_id: str) -> Problem:
     )
 
 
+def problem_response(error: RequestError, request_id: str) -> Response:
+    """The answer to a refused request."""
+    problem = problem_of(error, request_id)
+    return _response(problem.model_dump(), error.status, error.headers)
+
+
 def invalid_input(error: ValidationError | RequestValidationError) -> InvalidInputError:
     """Pydantic's complaints, naming each value by where the client wrote it."""
     return InvalidInputError(
@@ -70,8 +76,7 @@ async def _on_request_error(request: Request, error: Exception) -> Response:
             error.__cause__,
             extra={"request_id": request.state.request_id},
         )
-    problem = problem_of(error, request.state.request_id)
-    return _response(problem.model_dump(), error.status, error.headers)
+    return problem_response(error, request.state.request_id)
 
 
 async def _on_validation_error(request: Request, error: Exception) -> Response:
@@ -169,7 +174,7 @@ _EXAMPLES = {
     ),
     503: _example(
         "overloaded",
-        "OverloadedError",
+        "At capacity",
         "the service is at capacity; try again in 1 s",
         reason="deadline",
     ),

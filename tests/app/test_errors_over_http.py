@@ -38,7 +38,8 @@ def post(server: Server, data: bytes, path: str = "/v1/poses", **kwargs: Any) ->
 
 @pytest.mark.parametrize("path", ["/v1/poses", "/v1/poses/batch", "/v1/lift"])
 def test_empty_body(server: Server, path: str) -> None:
-    problem(post(server, b"", path), 400, "empty-body")
+    form = {"Content-Type": "multipart/form-data; boundary=b"} if "batch" in path else {}
+    problem(post(server, b"", path, headers=form), 400, "empty-body")
 
 
 def test_truncated_and_corrupt(server: Server, photo: bytes) -> None:

@@ -1,0 +1,130 @@
+"""One HTTP connection: uvicorn's, with the waits and sizes bounded that uvicorn leaves open.
+
+========================================= ==================================================
+a head that does not arrive               408 after ``patience_s``, closed without an answer
+                                          if not a byte of it came
+a head that does not end                  431 after ``MAX_HEAD_BYTES``
+bytes that are no HTTP                    400
+the rest of a body refused unread         read and dropped for ``patience_s``, then closed
+an answer that the client does not take   closed after ``patience_s``
+========================================= ==================================================
+
+These errors arise before there is a request, so they are written here, as problem+json like all
+others but without a request id.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable
+from http import HTTPStatus
+from typing import ClassVar
+
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+
+from app.errors import PROBLEM_TYPE_PREFIX
+
+MAX_HEAD_BYTES = 65_536
+
+
+class Connection(HttpToolsProtocol):
+    """uvicorn's protocol with patience; make a class with ``connection_class``."""
+
+    patience_s: ClassVar[float]
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Start waiting for the first head."""
+        super().connection_made(transport)
+        self._timers: dict[str, asyncio.TimerHandle] = {}
+        self._head_bytes = 0
+        self._expect("head", self.transport.close)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget all timers."""
+        for name in tuple(self._timers):
+            self._arrived(name)
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Feed the parser; a head may be split over many pieces but not over too many bytes."""
+        super().data_received(data)
+        if "head" in self._timers:
+            self._head_bytes += len(data)
+            if self._head_bytes > MAX_HEAD_BYTES:
+                self._end(431, "head-too-large", f"the head is larger than {MAX_HEAD_BYTES} bytes")
+
+    def on_message_begin(self) -> None:
+        """A head begins; the parser calls this."""
+        super().on_message_begin()
+        self._head_bytes = 0
+        why = f"the head of the request was not complete after {self.patience_s:g} s"
+        self._expect("head", lambda: self._end(408, "upload-too-slow", why))
+
+    def on_headers_complete(self) -> None:
+        """The head is complete; the parser calls this."""
+        self._arrived("head")
+        super().on_headers_complete()
+
+    def on_message_complete(self) -> None:
+        """The body is complete; the parser calls this."""
+        self._arrived("rest")
+        super().on_message_complete()
+
+    def on_response_complete(self) -> None:
+        """The answer is written, perhaps before its request was read to the end."""
+        super().on_response_complete()
+        if self.cycle.more_body and not self.transport.is_closing():
+            self._expect("rest", self.transport.abort)
+
+    def pause_writing(self) -> None:
+        """The client does not read as fast as it is answered."""
+        super().pause_writing()
+        self._expect("reader", self.transport.abort)
+
+    def resume_writing(self) -> None:
+        """The client has read on."""
+        self._arrived("reader")
+        super().resume_writing()
+
+    def send_400_response(self, msg: str) -> None:
+        """What is no HTTP is answered as a problem, too."""
+        self._end(400, "malformed-http", msg)
+
+    def _expect(self, name: str, otherwise: Callable[[], None]) -> None:
+        self._arrived(name)
+        self._timers[name] = self.loop.call_later(self.patience_s, otherwise)
+
+    def _arrived(self, name: str) -> None:
+        timer = self._timers.pop(name, None)
+        if timer is not None:
+            timer.cancel()
+
+    def _end(self, status: int, slug: str, detail: str) -> None:
+        """Answer with a problem and close, unless an answer is already under way."""
+        if self.transport.is_closing():
+            return
+        if self.cycle is None or self.cycle.response_complete:
+            self.transport.write(_encode_problem(HTTPStatus(status), slug, detail))
+        self.transport.close()
+
+
+def connection_class(patience_s: float) -> type[Connection]:
+    """The class to give to uvicorn."""
+    return type("Connection", (Connection,), {"patience_s": patience_s})
+
+
+def _encode_problem(status: HTTPStatus, slug: str, detail: str) -> bytes:
+    problem = {
+        "type": PROBLEM_TYPE_PREFIX + slug,
+        "title": status.phrase,
+        "status": status.value,
+        "detail": detail,
+    }
+    body = json.dumps(problem).encode()
+    head = (
+        f"HTTP/1.1 {status.value} {status.phrase}\r\n"
+        "content-type: application/problem+json\r\n"
+        f"content-length: {len(body)}\r\nconnection: close\r\n\r\n"
+    )
+    return head.encode() + body
