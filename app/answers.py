@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import numpy.typing as npt
@@ -11,10 +13,12 @@ from app import schemas
 from app.engine import Engine
 from app.lifting.types import Hypothesis, Intrinsics, LiftedPerson, Method
 from app.pipeline import LiftResult, PhotoResult, SeenPerson
+from library_store.conversion import CONVERSIONS
 from library_store.library import Library, Source
 from library_store.skeleton import LSP14
 
 Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
 
 LENGTH_DIGITS = 3
 """Decimals of pixels and millimetres."""
@@ -24,6 +28,53 @@ ROTATION_DIGITS = 9
 TIMING_DIGITS = 3
 
 SKELETON = schemas.Skeleton(name=LSP14.name, joint_names=LSP14.joint_names, edges=LSP14.edges)
+
+
+@dataclass(frozen=True)
+class Wording:
+    """The skeleton that an answer is given in: (N, 14) ``weights`` of the lsp14 joints.
+
+    ``known`` (N,) are the joints that lsp14 determines; the others' coordinates are nan.
+    """
+
+    skeleton: schemas.Skeleton
+    weights: Floats
+    known: Bools
+
+    def points(self, joints: Floats) -> Floats:
+        """(14, D) -> (N, D)."""
+        placed: Floats = self.weights @ joints
+        return placed
+
+    def sigma(self, sigma: Floats | None) -> list[float] | list[None]:
+        """68% radii (14,) -> (N,): of a mean of joints at most the mean of theirs."""
+        if sigma is None:
+            return [None] * len(self.weights)
+        return _list(self.weights @ sigma)
+
+    def confidence(self, confidence: Floats | None) -> list[float] | list[None]:
+        """(14,) -> (N,): a mean of joints is as sure as the least sure of them."""
+        if confidence is None:
+            return [None] * len(self.weights)
+        return _list(np.where(self.weights > 0, confidence, np.inf).min(axis=1))
+
+    def present(self, present: Bools) -> Bools:
+        """(14,) -> (N,): known, and made of joints that are all there."""
+        complete: Bools = self.known & (present | ~(self.weights > 0)).all(axis=1)
+        return complete
+
+
+@cache
+def wording_in(name: schemas.AnswerSkeleton) -> Wording:
+    """The wording in the skeleton of that name."""
+    conversion = CONVERSIONS[name]
+    skeleton = schemas.Skeleton(
+        name=conversion.skeleton.name,
+        joint_names=conversion.skeleton.joint_names,
+        edges=conversion.skeleton.edges,
+    )
+    weights = conversion.from_lsp14
+    return Wording(skeleton, weights, known=np.array(np.isfinite(weights).all(axis=1)))
 
 
 def model_of(engine: Engine) -> schemas.Model:
@@ -44,9 +95,14 @@ def library_of(library: Library) -> schemas.LibraryRef:
 
 
 def poses_answer(
-    engine: Engine, result: PhotoResult, method: Method, request_id: str
+    engine: Engine,
+    result: PhotoResult,
+    method: Method,
+    request_id: str,
+    skeleton: schemas.AnswerSkeleton = "lsp14",
 ) -> schemas.PosesAnswer:
     """The answer to POST /v1/poses, without the total time."""
+    wording = wording_in(skeleton)
     return schemas.PosesAnswer(
         request_id=request_id,
         method=method,
@@ -57,22 +113,27 @@ def poses_answer(
             height_px=result.height_px,
             orientation_applied=result.orientation,
         ),
-        skeleton=SKELETON,
-        people=tuple(_person(person, result.intrinsics) for person in result.people),
+        skeleton=wording.skeleton,
+        people=tuple(_person(person, result.intrinsics, wording) for person in result.people),
         timings_ms=rounded_timings(result.timings_ms),
     )
 
 
 def lift_answer(
-    engine: Engine, result: LiftResult, method: Method, request_id: str
+    engine: Engine,
+    result: LiftResult,
+    method: Method,
+    request_id: str,
+    skeleton: schemas.AnswerSkeleton = "lsp14",
 ) -> schemas.LiftAnswer:
     """The answer to POST /v1/lift, without the total time."""
+    wording = wording_in(skeleton)
     return schemas.LiftAnswer(
         request_id=request_id,
         method=method,
         library=library_of(engine.library),
-        skeleton=SKELETON,
-        people=tuple(_person(person, result.intrinsics) for person in result.people),
+        skeleton=wording.skeleton,
+        people=tuple(_person(person, result.intrinsics, wording) for person in result.people),
         timings_ms=rounded_timings(result.timings_ms),
     )
 
@@ -98,21 +159,19 @@ def rounded_timings(timings_ms: Mapping[str, float]) -> dict[str, float]:
     return {stage: round(spent, TIMING_DIGITS) for stage, spent in timings_ms.items()}
 
 
-def _person(person: SeenPerson, intrinsics: Intrinsics) -> schemas.Person:
-    n_joints = LSP14.n_joints
-    confidence = [None] * n_joints if person.confidence is None else _list(person.confidence)
-    sigma_px = [None] * n_joints if person.sigma_px is None else _list(person.sigma_px)
+def _person(person: SeenPerson, intrinsics: Intrinsics, wording: Wording) -> schemas.Person:
+    names = wording.skeleton.joint_names
     seen = {
         "box_px": tuple(round(value, LENGTH_DIGITS) for value in person.box_px),
         "score": None if person.score is None else round(person.score, RATIO_DIGITS),
         "joints_2d": tuple(
             schemas.Joint2D(name=name, x_px=x, y_px=y, confidence=c, sigma_px=s)
             for name, (x, y), c, s, present in zip(
-                LSP14.joint_names,
-                np.round(person.joints_px, LENGTH_DIGITS).tolist(),
-                confidence,
-                sigma_px,
-                person.present,
+                names,
+                np.round(wording.points(person.joints_px), LENGTH_DIGITS).tolist(),
+                wording.confidence(person.confidence),
+                wording.sigma(person.sigma_px),
+                wording.present(person.present),
                 strict=True,
             )
             if present
@@ -131,7 +190,7 @@ def _person(person: SeenPerson, intrinsics: Intrinsics) -> schemas.Person:
             warnings=(*lifted.warnings, lifted.reason),
         )
     best = lifted.exemplar
-    sigma_mm = [None] * n_joints if lifted.sigma_mm is None else _list(lifted.sigma_mm)
+    rows = _rows(wording.points(lifted.joints_3d_mm))
     return schemas.Person(
         **seen,
         exemplar=schemas.Exemplar(
@@ -139,10 +198,10 @@ def _person(person: SeenPerson, intrinsics: Intrinsics) -> schemas.Person:
             probability=round(best.probability, RATIO_DIGITS),
             distance=round(best.distance, RATIO_DIGITS),
             source=_source(best.source),
-            joints_mm=_rows(best.joints_mm),
-            warped_mm=_rows(lifted.warped_mm),
+            joints_mm=_rows(wording.points(best.joints_mm)),
+            warped_mm=_rows(wording.points(lifted.warped_mm)),
         ),
-        candidates=tuple(_candidate(candidate) for candidate in lifted.candidates),
+        candidates=tuple(_candidate(candidate, wording) for candidate in lifted.candidates),
         camera=schemas.Camera(
             focal_length_px=round(intrinsics.focal_length_px, LENGTH_DIGITS),
             principal_point_px=intrinsics.principal_point_px,
@@ -152,10 +211,9 @@ def _person(person: SeenPerson, intrinsics: Intrinsics) -> schemas.Person:
             reprojection_error_px=round(best.reprojection_error_px, LENGTH_DIGITS),
         ),
         joints_3d=tuple(
-            schemas.Joint3D(name=name, x_mm=x, y_mm=y, z_mm=z, sigma_mm=sigma)
-            for name, (x, y, z), sigma in zip(
-                LSP14.joint_names, _rows(lifted.joints_3d_mm), sigma_mm, strict=True
-            )
+            schemas.Joint3D(name=name, x_mm=row[0], y_mm=row[1], z_mm=row[2], sigma_mm=sigma)
+            for name, row, sigma in zip(names, rows, wording.sigma(lifted.sigma_mm), strict=True)
+            if row is not None
         ),
         root_mm=_vector(lifted.root_mm),
         scale_source=lifted.scale_source,
@@ -163,12 +221,12 @@ def _person(person: SeenPerson, intrinsics: Intrinsics) -> schemas.Person:
     )
 
 
-def _candidate(hypothesis: Hypothesis) -> schemas.Candidate:
+def _candidate(hypothesis: Hypothesis, wording: Wording) -> schemas.Candidate:
     return schemas.Candidate(
         id=hypothesis.exemplar_id,
         probability=round(hypothesis.probability, RATIO_DIGITS),
         reprojection_error_px=round(hypothesis.reprojection_error_px, LENGTH_DIGITS),
-        joints_mm=_rows(hypothesis.joints_mm),
+        joints_mm=_rows(wording.points(hypothesis.joints_mm)),
     )
 
 
@@ -189,8 +247,9 @@ def _vector(values: Floats) -> schemas.Vector3:
 
 
 def _rows(points: Floats) -> schemas.Pose:
-    # Adding 0.0 turns -0.0 into 0.0: one text per number.
-    return tuple(map(tuple, (np.round(points, LENGTH_DIGITS) + 0.0).tolist()))
+    # Adding 0.0 turns -0.0 into 0.0: one text per number. Only nan differs from itself.
+    rows = (np.round(points, LENGTH_DIGITS) + 0.0).tolist()
+    return tuple(tuple(row) if row[0] == row[0] else None for row in rows)
 
 
 def _matrix(rotation: Floats) -> schemas.Matrix3:

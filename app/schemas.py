@@ -8,20 +8,31 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
-from library_store.skeleton import LSP14
+from library_store.conversion import CONVERSIONS
 
 Method = Literal["fusion", "paper"]
 Vector2 = tuple[float, float]
 Vector3 = tuple[float, float, float]
 Box = tuple[float, float, float, float]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
-Pose = tuple[Vector3, ...]
+Pose = tuple[Vector3 | None, ...]
+"""Joints in the answer's order; null where its skeleton has a joint that lsp14 does not give."""
+GivenSkeleton = Literal["lsp14", "coco17", "h36m17", "openpose18", "mediapipe33"]
+AnswerSkeleton = Literal["lsp14", "coco17", "h36m17"]
 
 MAX_LIFT_PEOPLE = 256
 MAX_CANDIDATES = 50
 MAX_COORDINATE_PX = 1e6
+MAX_GIVEN_JOINTS = max(c.skeleton.n_joints for c in CONVERSIONS.values())
 
 FocalLengthPx = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
 SubjectHeightMm = Annotated[float, Field(ge=300, le=3000, allow_inf_nan=False)]
@@ -161,6 +172,8 @@ class Person(Answer):
     """One person; the 3D fields are null when too little of them is seen, and a warning says so.
 
     ``joints_2d`` of a photo lists every joint of the skeleton, that of /v1/lift the joints given.
+    Of an answer in another skeleton than lsp14, ``joints_2d`` and ``joints_3d`` leave out the
+    joints that lsp14 does not determine (coco17: the face).
     ``box_px`` is x, y, width, height of the joints' extent; ``score`` is null when the client
     gave the box or the joints. ``root_mm`` is the midpoint of the hips.
     """
@@ -213,13 +226,11 @@ class GivenJoint(Given):
 class GivenPerson(Given):
     """A person's 2D joints; those left out are missing."""
 
-    joints_2d: tuple[GivenJoint, ...] = Field(max_length=LSP14.n_joints)
+    joints_2d: tuple[GivenJoint, ...] = Field(max_length=MAX_GIVEN_JOINTS)
 
     @model_validator(mode="after")
-    def _names_are_known_and_distinct(self) -> Self:
+    def _names_are_distinct(self) -> Self:
         names = [joint.name for joint in self.joints_2d]
-        if unknown := sorted(set(names) - set(LSP14.joint_names)):
-            raise ValueError(f"unknown joints of lsp14: {', '.join(unknown)}")
         if len(set(names)) < len(names):
             raise ValueError("a joint is given twice")
         return self
@@ -233,16 +244,34 @@ class ImageSize(Given):
 
 
 class LiftRequest(Given):
-    """2D joints in, no photo; focal length and principal point default as for photos."""
+    """2D joints in, no photo; focal length and principal point default as for photos.
+
+    ``skeleton`` names the joints given, ``answer_skeleton`` those of the answer.
+    """
 
     image: ImageSize
     focal_length_px: FocalLengthPx | None = None
     principal_point_px: Vector2 | None = None
-    skeleton: Literal["lsp14"] = "lsp14"
+    skeleton: GivenSkeleton = "lsp14"
+    answer_skeleton: AnswerSkeleton = "lsp14"
     method: Method = "fusion"
     candidates: Candidates = 3
     subject_height_mm: SubjectHeightMm | None = None
     people: tuple[GivenPerson, ...] = Field(max_length=MAX_LIFT_PEOPLE)
+
+    @field_validator("people")
+    @classmethod
+    def _joints_are_of_the_skeleton(
+        cls, people: tuple[GivenPerson, ...], info: ValidationInfo
+    ) -> tuple[GivenPerson, ...]:
+        if (name := info.data.get("skeleton")) is None:  # wrong itself, and said so
+            return people
+        known = set(CONVERSIONS[name].skeleton.joint_names)
+        for number, person in enumerate(people):
+            given = {joint.name for joint in person.joints_2d}
+            if unknown := sorted(given - known):
+                raise ValueError(f"unknown joints of {name} in people.{number}: {unknown}")
+        return people
 
     @model_validator(mode="after")
     def _principal_point_is_near(self) -> Self:

@@ -15,7 +15,7 @@ from app.api.deps import EngineDep, ServiceDep, authorise
 from app.api.problems import describe, describe_ok, invalid_input
 from app.errors import MalformedBodyError
 from app.pipeline import LiftQuery
-from library_store.skeleton import LSP14
+from library_store.conversion import CONVERSIONS
 
 router = APIRouter(tags=["lift"], dependencies=[Depends(authorise)])
 
@@ -54,7 +54,9 @@ async def lift_people(request: Request, service: ServiceDep, engine: EngineDep) 
                 wait_ms = 1e3 * (time.monotonic() - arrival.at_s)
                 wanted = parse_lift_request(body)
                 result = engine.pipeline.lift(query_of(wanted))
-                answer = lift_answer(engine, result, wanted.method, request_id)
+                answer = lift_answer(
+                    engine, result, wanted.method, request_id, wanted.answer_skeleton
+                )
                 total_ms = 1e3 * (time.monotonic() - arrival.at_s)
                 timings_ms = {"wait": wait_ms} | answer.timings_ms | {"total": total_ms}
                 answer = answer.model_copy(update={"timings_ms": rounded_timings(timings_ms)})
@@ -76,14 +78,16 @@ def parse_lift_request(body: bytes) -> schemas.LiftRequest:
 
 
 def query_of(wanted: schemas.LiftRequest) -> LiftQuery:
-    """The pipeline's form of a request: arrays in the skeleton's order, 0 where missing."""
-    joints_px = np.zeros((len(wanted.people), LSP14.n_joints, 2))
-    confidence = np.zeros((len(wanted.people), LSP14.n_joints))
+    """The pipeline's form of a request: arrays in lsp14's order, 0 where missing."""
+    conversion = CONVERSIONS[wanted.skeleton]
+    given_px = np.zeros((len(wanted.people), conversion.skeleton.n_joints, 2))
+    sure = np.zeros((len(wanted.people), conversion.skeleton.n_joints))
     for row, person in enumerate(wanted.people):
         for joint in person.joints_2d:
-            column = LSP14.index(joint.name)
-            joints_px[row, column] = joint.x_px, joint.y_px
-            confidence[row, column] = joint.confidence
+            column = conversion.skeleton.index(joint.name)
+            given_px[row, column] = joint.x_px, joint.y_px
+            sure[row, column] = joint.confidence
+    joints_px, confidence = conversion.to_lsp14(given_px, sure)
     return LiftQuery(
         width_px=wanted.image.width_px,
         height_px=wanted.image.height_px,

@@ -49,6 +49,9 @@ class PoseParameters(schemas.Given):
     method: schemas.Method = Field(
         "fusion", description="`paper` is the method of Chen & Ramanan (2017) to the letter."
     )
+    skeleton: schemas.AnswerSkeleton = Field(
+        "lsp14", description="In whose joints to answer. Joints that lsp14 does not give are null."
+    )
     box_px: str | None = Field(
         None,
         description="`x,y,w,h`: the extent of the one person to look at; skips detection.",
@@ -90,7 +93,7 @@ class PoseParameters(schemas.Given):
     def query(self) -> PhotoQuery:
         """The pipeline's form of these parameters."""
         box_px = None if self.box_px is None else _parse_box(self.box_px)
-        return PhotoQuery(**{**self.model_dump(), "box_px": box_px})
+        return PhotoQuery(**{**self.model_dump(exclude={"skeleton"}), "box_px": box_px})
 
 
 def _parse_box(text: str) -> schemas.Box:
@@ -160,7 +163,7 @@ async def estimate_poses(
                 _work(
                     engine,
                     lambda: photo_bytes(body, content_type),
-                    parameters.query(),
+                    parameters,
                     request.state.request_id,
                     arrival,
                 ),
@@ -174,16 +177,17 @@ async def estimate_poses(
 def _work(
     engine: Engine,
     photo: Callable[[], bytes],
-    query: PhotoQuery,
+    parameters: PoseParameters,
     request_id: str,
     arrival: Arrival,
 ) -> Callable[[], tuple[schemas.PosesAnswer, bytes]]:
     """The computation of one photo up to its JSON, to be run on a worker thread."""
+    query = parameters.query()
 
     def work() -> tuple[schemas.PosesAnswer, bytes]:
         wait_ms = 1e3 * (time.monotonic() - arrival.at_s)
         result = engine.pipeline.estimate(photo(), query)
-        answer = poses_answer(engine, result, query.method, request_id)
+        answer = poses_answer(engine, result, query.method, request_id, parameters.skeleton)
         total_ms = 1e3 * (time.monotonic() - arrival.at_s)
         timings_ms = {"wait": wait_ms} | answer.timings_ms | {"total": total_ms}
         answer = answer.model_copy(update={"timings_ms": rounded_timings(timings_ms)})
@@ -241,7 +245,7 @@ async def estimate_batch(
             work = _batch_work(
                 engine,
                 images,
-                parameters.query(),
+                parameters,
                 request.state.request_id,
                 arrival,
                 limits.max_body_bytes,
@@ -257,7 +261,7 @@ async def estimate_batch(
 def _batch_work(
     engine: Engine,
     images: Sequence[Part],
-    query: PhotoQuery,
+    parameters: PoseParameters,
     request_id: str,
     arrival: Arrival,
     limit_bytes: int,
@@ -273,7 +277,7 @@ def _batch_work(
             photo = _one_photo(image.data, limit_bytes)
             own = Arrival(time.monotonic(), arrival.gone)
             try:
-                answer, _ = _work(engine, photo, query, request_id, own)()
+                answer, _ = _work(engine, photo, parameters, request_id, own)()
                 items.append(schemas.BatchItem(name=name, answer=answer, problem=None))
             except RequestError as error:
                 problem = problem_of(error, request_id)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from app.schemas import LiftAnswer
+from library_store.conversion import CONVERSIONS
 from library_store.skeleton import L_ANKLE, LSP14, R_ANKLE
 from tests.app.conftest import Render
 from tests.app.server import Server
@@ -138,11 +139,11 @@ def test_nobody_and_many(server: Server, renders: list[Render]) -> None:
 @pytest.mark.parametrize(
     ("change", "where"),
     [
-        ({"skeleton": "coco17"}, "skeleton"),
+        ({"skeleton": "coco25"}, "skeleton"),
         ({"focal_length_px": -1}, "focal_length_px"),
         ({"image": {"width_px": 0, "height_px": 5}}, "image.width_px"),
         ({"colour": "red"}, "colour"),
-        ({"people": [{"joints_2d": [{"name": "nose", "x_px": 1, "y_px": 2}]}]}, "people.0"),
+        ({"people": [{"joints_2d": [{"name": "nose", "x_px": 1, "y_px": 2}]}]}, "people"),
         (
             {"people": [{"joints_2d": [{"name": "neck", "x_px": 1, "y_px": 2}] * 2}]},
             "people.0",
@@ -171,3 +172,78 @@ def test_nan_is_no_coordinate(server: Server) -> None:
     text += '[{"name":"neck","x_px":NaN,"y_px":1}]}]}'
     response = server.client.post("/v1/lift", content=text.encode())
     assert response.status_code in {400, 422}
+
+
+def in_skeleton(render: Render, name: str, leave_out: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The render's person with the joints of another skeleton; its face is unknown."""
+    conversion = CONVERSIONS[name]
+    points = conversion.from_lsp14 @ render.joints_px
+    return {
+        "joints_2d": [
+            {"name": joint, "x_px": x, "y_px": y}
+            for joint, (x, y) in zip(conversion.skeleton.joint_names, points.tolist(), strict=True)
+            if np.isfinite(x) and joint not in leave_out
+        ]
+    }
+
+
+def test_human36m_joints_give_what_the_same_lsp14_joints_give(
+    server: Server, renders: list[Render]
+) -> None:
+    render = renders[0]
+    (ours,) = lift(server, request_of(render))
+    (theirs,) = lift(
+        server, request_of(render, skeleton="h36m17", people=[in_skeleton(render, "h36m17")])
+    )
+    assert theirs == ours
+
+
+@pytest.mark.parametrize("name", ["coco17", "openpose18", "mediapipe33"])
+def test_skeletons_of_photos_are_lifted_nearly_as_well(
+    server: Server, renders: list[Render], name: str
+) -> None:
+    ours, theirs = [], []
+    for render in renders:
+        (person,) = lift(server, request_of(render))
+        ours.append(root_relative_error_mm(person, render))
+        (person,) = lift(
+            server, request_of(render, skeleton=name, people=[in_skeleton(render, name)])
+        )
+        theirs.append(root_relative_error_mm(person, render))
+    assert np.mean(theirs) < 1.5 * np.mean(ours) + 20
+
+
+@pytest.mark.parametrize("name", ["coco17", "h36m17"])
+def test_answers_come_in_other_skeletons(server: Server, renders: list[Render], name: str) -> None:
+    render = renders[0]
+    body = request_of(render, answer_skeleton=name)
+    response = server.client.post("/v1/lift", json=body)
+    LiftAnswer.model_validate_json(response.content)
+    assert response.json()["skeleton"]["name"] == name
+    (person,) = response.json()["people"]
+    (ours,) = lift(server, request_of(render))
+    conversion = CONVERSIONS[name]
+    known = np.isfinite(conversion.from_lsp14).all(axis=1)
+    names = np.array(conversion.skeleton.joint_names)[known].tolist()
+    assert [j["name"] for j in person["joints_2d"]] == names
+    assert [j["name"] for j in person["joints_3d"]] == names
+    pose = person["exemplar"]["joints_mm"]
+    assert [row is not None for row in pose] == known.tolist()
+    wanted = conversion.from_lsp14[known] @ np.array(ours["exemplar"]["joints_mm"])
+    np.testing.assert_allclose(
+        [row for row in pose if row is not None], wanted, atol=0.002, rtol=1e-9
+    )
+    at = {j["name"]: [j["x_mm"], j["y_mm"], j["z_mm"]] for j in person["joints_3d"]}
+    ours_at = {j["name"]: [j["x_mm"], j["y_mm"], j["z_mm"]] for j in ours["joints_3d"]}
+    assert at["right_wrist"] == ours_at["r_wrist"]
+    for joint in person["joints_3d"]:
+        assert joint["sigma_mm"] > 0
+
+
+def test_joints_of_another_skeleton_than_named_are_refused(
+    server: Server, renders: list[Render]
+) -> None:
+    render = renders[0]
+    body = request_of(render, people=[in_skeleton(render, "coco17")])
+    document = problem(server.client.post("/v1/lift", json=body), 422, "invalid-input")
+    assert "unknown joints of lsp14 in people.0: ['left_ankle'" in str(document)
