@@ -102,6 +102,40 @@ def calibration_error(probability: Floats, happened: NDArray[np.bool_], bins: in
     return float(gap)
 
 
+def draw_reliability(
+    path: Path, probability: Floats, check: Readings, names: tuple[str, ...], bins: int = 10
+) -> None:
+    """Stated against observed, a curve for each kind of joint, left and right together (PNG)."""
+    import matplotlib  # a large import that only this picture needs
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    parts = dict.fromkeys(name.removeprefix("r_").removeprefix("l_") for name in names)
+    figure, axes = plt.subplots(2, 4, figsize=(10, 5.2), sharex=True, sharey=True)
+    for axis, part in zip(axes.flat, parts, strict=True):
+        chosen = [j for j, name in enumerate(names) if name.endswith(part)]
+        judged = check.judged[:, chosen]
+        stated, near = probability[:, chosen][judged], check.near[:, chosen][judged]
+        bin_of = np.minimum((stated * bins).astype(int), bins - 1)
+        filled = [b for b in range(bins) if (bin_of == b).sum() >= 10]
+        axis.plot([0, 1], [0, 1], color="0.7", linewidth=1)
+        axis.plot(
+            [stated[bin_of == b].mean() for b in filled],
+            [near[bin_of == b].mean() for b in filled],
+            marker="o",
+            markersize=4,
+        )
+        axis.hist(stated, bins=bins, range=(0, 1), weights=np.full(len(stated), 1 / len(stated)))
+        error = calibration_error(stated, near)
+        axis.set_title(f"{part.replace('_', ' ')}: error {error:.3f}", fontsize=9)
+    figure.supxlabel("confidence stated")
+    figure.supylabel("share within 0.2 torso lengths")
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
 def accuracy(data: Readings, joints: tuple[int, ...]) -> float:
     """PCK@0.2 over the labelled ones of ``joints``."""
     chosen = list(joints)
@@ -117,6 +151,7 @@ def main() -> None:
     parser.add_argument("--train", default="lspet_train_a,lspet_train_b,photos_a,photos_b")
     parser.add_argument("--test", default="lspet_val")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--figure", type=Path, help="draw the reliability diagram here (PNG)")
     args = parser.parse_args()
     cv2.setNumThreads(1)
 
@@ -178,7 +213,19 @@ def main() -> None:
         }
     )
     path.write_text(ModelCard.model_validate(updated).model_dump_json(indent=2) + "\n")
+    if args.figure:
+        draw_reliability(args.figure, stated, check, tuple(output.joint_names))
+    outside = check.judged & ~check.labelled
+    seen = check.labelled
     print(measured)
+    print(
+        {
+            "median confidence of joints outside the crop": round(
+                float(np.median(stated[outside])), 3
+            ),
+            "of labelled joints": round(float(np.median(stated[seen])), 3),
+        }
+    )
     print({"ece": round(ece, 4), "coverage_68": round(coverage, 4)})
 
 
