@@ -103,6 +103,7 @@ def test_openapi_is_whole_and_its_examples_hold(server: Server) -> None:
         "max_people",
         "candidates",
         "method",
+        "skeleton",
         "box_px",
         "focal_length_px",
         "fov_deg",
