@@ -18,12 +18,11 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
-from fastapi.responses import HTMLResponse
 from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
 
 from app import schemas
-from app.api import exemplars, health, info, lift, metrics, poses, problems
+from app.api import exemplars, health, info, lift, metrics, page, poses, problems
 from app.api.deps import Service
 from app.api.shedding import SheddingMiddleware
 from app.engine import load_engine
@@ -35,11 +34,6 @@ from app.version import VERSION
 logger = logging.getLogger("posematch")
 
 _HERE = Path(__file__).resolve().parent
-
-_PAGE_POLICY = (
-    "default-src 'none'; connect-src 'self'; img-src data: blob:; style-src 'unsafe-inline'; "
-    "script-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
 
 _DESCRIPTION = """\
 POST a photo, get every person's 2D joints, the matched exemplar, the camera and a 3D skeleton.
@@ -131,12 +125,7 @@ def create_app(
     problems.install(app)
     for router in (poses, lift, exemplars, info, health, metrics):
         app.include_router(router.router)
-
-    page = (_HERE / "static" / "index.html").read_text()
-
-    @app.get("/", include_in_schema=False)
-    async def get_page() -> HTMLResponse:
-        return HTMLResponse(page, headers={"Content-Security-Policy": _PAGE_POLICY})
+    app.include_router(page.page_router(_HERE / "static"))
 
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

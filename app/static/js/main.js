@@ -1,0 +1,189 @@
+// The page: one photo at a time, its answer on two plates and in words. State lives here.
+
+import { Refusal, curlCommand, estimate, fetchInfo } from "./api.js";
+import { Panels } from "./panels.js";
+import { PhotoView } from "./photo.js";
+import { listenForPhotos } from "./sources.js";
+import { captionOf, refusalInWords, viewInWords } from "./words.js";
+
+const $ = (id) => document.getElementById(id);
+
+/** The photo shown and asked about, and what came back. */
+const state = { photo: null, name: "", bitmap: null, answer: null, selected: 0 };
+let stage = null;
+let inFlight = null;
+
+const photoView = new PhotoView($("photo"), { onPerson: select, onJoint: light });
+const panels = new Panels({ onPerson: select, onCandidate: pickCandidate, onJoint: light });
+
+listenForPhotos(open);
+$("form").addEventListener("change", () => $("form").reportValidity() && state.photo && ask());
+$("form").addEventListener("submit", (event) => event.preventDefault());
+for (const button of document.querySelectorAll("[data-copy]")) {
+  button.addEventListener("click", () => copy(button));
+}
+for (const query of ["(prefers-color-scheme: dark)", "(min-width: 40rem)"]) {
+  matchMedia(query).addEventListener("change", redraw);
+}
+addEventListener("resize", () => panels.redraw());
+openStage();
+
+/** Take in a photo, show it and ask about it. */
+async function open(photo, name) {
+  inFlight?.abort();
+  Object.assign(state, { photo, name, answer: null, selected: 0 });
+  // Not every browser decodes what is dropped here; the service says why it does not either.
+  state.bitmap = await createImageBitmap(photo, { imageOrientation: "from-image" }).catch(() => null);
+  if (state.photo !== photo) return;
+  $("welcome").hidden = state.bitmap !== null;
+  photoView.show(state.bitmap);
+  $("photo").setAttribute("aria-label", `The photo ${name}`);
+  await ask();
+}
+
+/** Ask about the photo with the options as they are. */
+async function ask() {
+  inFlight?.abort();
+  const mine = new AbortController();
+  inFlight = mine;
+  const { query, key } = options();
+  $("refusal").hidden = true;
+  const scan = setTimeout(() => ($("scan").hidden = false), 250);
+  caption(`${state.name}: asking …`);
+  try {
+    await refuseTooLarge(key);
+    const answer = await estimate(state.photo, query, {
+      key,
+      signal: mine.signal,
+      onWait: (seconds, problem) =>
+        caption(`${problem?.title ?? "Busy"}: asking again in ${Math.ceil(seconds)} s`),
+    });
+    if (mine === inFlight) show(answer, query, key);
+  } catch (error) {
+    if (mine === inFlight && error.name !== "AbortError") refuse(error);
+  } finally {
+    clearTimeout(scan);
+    if (mine === inFlight) $("scan").hidden = true;
+  }
+}
+
+/** A body over the limit is cut off by the server, which browsers report as a lost connection. */
+async function refuseTooLarge(key) {
+  if (state.photo.size < 1e6) return;
+  const limit = (await fetchInfo(key))?.limits.max_body_bytes;
+  if (state.photo.size > limit) {
+    const detail = `the file has ${state.photo.size} bytes, the limit is ${limit}`;
+    throw new Refusal(413, { type: "urn:posematch:problem:body-too-large", detail });
+  }
+}
+
+function options() {
+  const fields = Object.fromEntries(new FormData($("form")));
+  const { key, ...given } = fields;
+  const query = new URLSearchParams({ candidates: 10 });
+  for (const [name, value] of Object.entries(given)) {
+    if (value !== "") query.set(name, name === "mirrored" ? "true" : value);
+  }
+  return { query, key };
+}
+
+function show(answer, query, key) {
+  Object.assign(state, { answer, selected: 0 });
+  caption(captionOf(state.name, answer));
+  photoView.overlay(answer, 0);
+  panels.showAnswer(answer, 0);
+  stage?.show(answer, 0, state.bitmap);
+  const type = state.photo.type || "application/octet-stream";
+  $("curl").textContent = curlCommand(state.name, type, query.toString(), key !== "");
+}
+
+function refuse(error) {
+  state.answer = null;
+  panels.showAnswer(null, 0);
+  stage?.show(null, 0, null);
+  caption(state.name);
+  const words =
+    error instanceof Refusal
+      ? refusalInWords(error)
+      : { headline: "The server cannot be reached.", advice: "Is it still running?", detail: error.message };
+  const small = document.createElement("small");
+  small.textContent = words.detail + (words.id ? ` (request ${words.id})` : "");
+  $("refusal").replaceChildren(`${words.headline} ${words.advice}`, small);
+  $("refusal").hidden = false;
+  if (error.status === 401) {
+    $("options").open = true;
+    $("form").elements.key.focus();
+  }
+}
+
+function select(index) {
+  if (index === state.selected && stage?.selected === index) return;
+  state.selected = index;
+  photoView.overlay(state.answer, index);
+  panels.showPerson(state.answer, index);
+  stage?.select(index);
+}
+
+function pickCandidate(index) {
+  $("show-exemplar").checked = true;
+  panels.checkCandidate(state.answer.people[state.selected], index);
+  stage?.set({ candidate: index, exemplar: true });
+}
+
+function light(index) {
+  photoView.light(index);
+  panels.light(index);
+  stage?.light(index);
+}
+
+function redraw() {
+  panels.redraw();
+  stage?.recolour();
+}
+
+/** The 3D view comes after the rest: its library is most of the page's weight. */
+async function openStage() {
+  const names = ["camera", "exemplar", "sigma"];
+  const shown = () => Object.fromEntries(names.map((name) => [name, $(`show-${name}`).checked]));
+  const views = [...document.querySelectorAll("[data-view]")];
+  const press = (name) => {
+    for (const button of views) button.setAttribute("aria-pressed", String(button.dataset.view === name));
+  };
+  try {
+    const { Stage } = await import("./stage.js");
+    stage = new Stage($("stage"), {
+      shown: shown(),
+      onView: (azimuth, elevation, preset) => {
+        $("stage-caption").textContent = viewInWords(azimuth, elevation);
+        press(preset);
+      },
+      onJoint: light,
+    });
+  } catch (error) {
+    console.warn("no 3D view:", error);
+    $("stage").hidden = true;
+    $("stage-notice").hidden = false;
+    $("stage-notice").textContent =
+      "This browser does not let the page draw in 3D (WebGL 2). The numbers below are complete.";
+    return;
+  }
+  for (const name of names) $(`show-${name}`).addEventListener("change", () => stage.set(shown()));
+  for (const button of views) button.addEventListener("click", () => stage.view(button.dataset.view));
+  if (state.answer) stage.show(state.answer, state.selected, state.bitmap);
+}
+
+function caption(text) {
+  $("photo-caption").textContent = text;
+}
+
+async function copy(button) {
+  const source = $(button.dataset.copy);
+  const isCopied = await navigator.clipboard?.writeText(source.textContent).then(
+    () => true,
+    () => false,
+  );
+  // Without HTTPS there is no clipboard: select the text, so that the keyboard copies it.
+  if (!isCopied) getSelection().selectAllChildren(source);
+  button.textContent = isCopied ? "Copied" : "Selected";
+  setTimeout(() => (button.textContent = "Copy"), 1500);
+}
