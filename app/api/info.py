@@ -10,7 +10,7 @@ from app import schemas
 from app.answers import SKELETON, library_of, model_of
 from app.api.deps import EngineDep, ServiceDep, authorise
 from app.api.problems import describe
-from app.imaging import ACCEPTED_TYPES
+from app.imaging import accepted_types
 from app.version import VERSION
 
 router = APIRouter(tags=["info"], dependencies=[Depends(authorise)])
@@ -34,7 +34,7 @@ async def get_info(service: ServiceDep, engine: EngineDep) -> schemas.InfoAnswer
         skeleton=SKELETON,
         methods=get_args(schemas.Method),
         limits=schemas.Limits(
-            accepted_types=ACCEPTED_TYPES,
+            accepted_types=accepted_types(),
             max_body_bytes=settings.max_body_bytes,
             max_batch_body_bytes=settings.max_batch_body_bytes,
             max_batch_images=settings.max_batch_images,

@@ -31,7 +31,7 @@ from app.errors import (
     MalformedBodyError,
     RequestError,
 )
-from app.imaging import ACCEPTED_TYPES
+from app.imaging import KNOWN_TYPES
 from app.pipeline import PhotoQuery
 
 router = APIRouter(tags=["poses"], dependencies=[Depends(authorise)])
@@ -133,7 +133,7 @@ _FOUND = "Everybody found; nobody found is an answer too."
     openapi_extra={
         "requestBody": {
             "required": True,
-            "content": dict.fromkeys(ACCEPTED_TYPES, _BINARY) | _form(_BINARY["schema"]),
+            "content": dict.fromkeys(KNOWN_TYPES, _BINARY) | _form(_BINARY["schema"]),
         }
     },
 )
@@ -146,7 +146,8 @@ async def estimate_poses(
     """The body is the photo itself, or a form with the photo in its field `image`.
 
     Pixels are those of the upright photo (EXIF orientation applied), (0, 0) the centre of its
-    top-left pixel. Millimetres are in the camera frame: x right, y down, z forward.
+    top-left pixel. Millimetres are in the camera frame: x right, y down, z forward. HEIC needs the
+    server's `heic` extra: `/v1/info` lists the types it accepts.
     """
     limits = service.settings
     content_type = request.headers.get("content-type")

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from app.errors import TooManyPixelsError, UndecodableImageError
 from app.imaging.exif import read_exif
 from app.imaging.headers import ImageHeader, read_header
+from app.imaging.heic import HEIC_TYPE, decode_heic
 
 _REDUCED = {
     1: cv2.IMREAD_COLOR,
@@ -35,6 +36,9 @@ _TO_UPRIGHT = {
     7: (True, True, True),
     8: (True, False, True),
 }
+
+
+_STRIP_ROWS = 64
 
 
 @dataclass(frozen=True)
@@ -74,7 +78,7 @@ def decode_photo(
     box_px: tuple[float, float, float, float] | None = None,
     box_side_px: int = 384,
 ) -> Photo:
-    """Decode ``data`` (JPEG, PNG or WebP) and turn it upright.
+    """Decode ``data`` (JPEG, PNG, WebP, HEIC with its extra) and turn it upright.
 
     A JPEG is decoded at 1/2, 1/4 or 1/8 as long as its longer side keeps ``side_px`` pixels, or,
     when the client says where the person is, as long as that box keeps ``box_side_px``.
@@ -87,6 +91,8 @@ def decode_photo(
     if header.width_px * header.height_px > max_pixels:
         raise TooManyPixelsError(header.width_px, header.height_px, max_pixels)
     exif = read_exif(header.exif)
+    if header.decoded_upright:
+        exif = replace(exif, orientation=1)
     long_side, wanted = max(header.width_px, header.height_px), side_px
     if box_px is not None:
         long_side, wanted = int(max(box_px[2:])), box_side_px
@@ -130,6 +136,8 @@ def _reduction(header: ImageHeader, long_side_px: int, wanted_px: int) -> int:
 
 def _decode(data: bytes, header: ImageHeader, reduction: int) -> npt.NDArray[np.uint8]:
     """Stored pixels, not turned, as (h, w, 3) BGR uint8."""
+    if header.media_type == HEIC_TYPE:
+        return _opaque_bgr(decode_heic(data))
     flags = cv2.IMREAD_UNCHANGED if header.has_alpha else _REDUCED[reduction]
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -146,12 +154,17 @@ def _decode(data: bytes, header: ImageHeader, reduction: int) -> npt.NDArray[np.
 def _opaque_bgr(pixels: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
     """(h, w[, 1|3|4]) of 8 or 16 bits -> (h, w, 3) of 8 bits, transparent pixels on white."""
     if pixels.dtype == np.uint16:
-        pixels = (pixels.astype(np.uint16) >> 8).astype(np.uint8)
+        pixels = cv2.convertScaleAbs(pixels, alpha=1 / 257)
     image = _bytes(pixels)
     if image.ndim == 2 or image.shape[2] == 1:
         return _bytes(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
     if image.shape[2] == 3:
         return image
-    alpha = image[..., 3:].astype(np.uint16)
-    blended = (image[..., :3] * alpha + 255 * (255 - alpha) + 127) // 255
-    return _bytes(blended)
+    opaque = np.empty((*image.shape[:2], 3), np.uint8)
+    for top in range(0, len(image), _STRIP_ROWS):  # the wider numbers of a strip, not of all
+        strip = image[top : top + _STRIP_ROWS]
+        alpha = strip[..., 3:].astype(np.uint16)
+        opaque[top : top + _STRIP_ROWS] = (
+            strip[..., :3] * alpha + 255 * (255 - alpha) + 127
+        ) // 255
+    return opaque

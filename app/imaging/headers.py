@@ -1,4 +1,4 @@
-"""Type, size, completeness and EXIF block of a JPEG, PNG or WebP, without decoding a pixel.
+"""Type, size, completeness and EXIF block of a JPEG, PNG, WebP or HEIC, without decoding a pixel.
 
 Decoders forgive: OpenCV returns the upper half of a truncated JPEG and greys the rest. The walks
 below go over the container to its end, so that a truncated file is an error, and they bound the
@@ -13,19 +13,19 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 from app.errors import UndecodableImageError, UnsupportedImageTypeError
+from app.imaging.heic import HEIC_TYPE, is_available, is_heic, read_heic_header
 
-ACCEPTED_TYPES = ("image/jpeg", "image/png", "image/webp")
+_ALWAYS_ACCEPTED = ("image/jpeg", "image/png", "image/webp")
+KNOWN_TYPES = (*_ALWAYS_ACCEPTED, HEIC_TYPE)
+"""What can be accepted; HEIC only where its extra is installed."""
+_HEIC_NEEDS = "HEIC, which needs the server's `heic` extra"
 
 _MAX_PIECES = 65_536
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _JPEG_NOT_FILL = re.compile(rb"[^\xff]")
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
 _ISO_BRANDS = {
-    b"heic": "HEIC",
-    b"heix": "HEIC",
-    b"hevc": "HEIC",
-    b"heim": "HEIC",
-    b"heis": "HEIC",
+    b"hevc": "a HEIF sequence",
     b"mif1": "HEIF",
     b"msf1": "HEIF",
     b"avif": "AVIF",
@@ -50,7 +50,8 @@ class ImageHeader:
     """What the container says of its image.
 
     ``width_px`` and ``height_px`` are those stored, before any EXIF orientation; ``exif`` is the
-    TIFF block of the EXIF data; ``has_alpha`` says that some pixels may be transparent.
+    TIFF block of the EXIF data; ``has_alpha`` says that some pixels may be transparent;
+    ``decoded_upright`` that the decoder applies the orientation.
     """
 
     media_type: str
@@ -58,6 +59,12 @@ class ImageHeader:
     height_px: int
     exif: bytes | None
     has_alpha: bool
+    decoded_upright: bool = False
+
+
+def accepted_types() -> tuple[str, ...]:
+    """The media types this installation decodes."""
+    return KNOWN_TYPES if is_available() else _ALWAYS_ACCEPTED
 
 
 def read_header(data: bytes) -> ImageHeader:
@@ -72,8 +79,18 @@ def read_header(data: bytes) -> ImageHeader:
         header = _read_png(data)
     elif data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         header = _read_webp(data)
+    elif is_heic(data) and is_available():
+        heic = read_heic_header(data)
+        header = ImageHeader(
+            HEIC_TYPE,
+            heic.width_px,
+            heic.height_px,
+            heic.exif,
+            heic.has_alpha,
+            decoded_upright=True,
+        )
     else:
-        raise UnsupportedImageTypeError(_other_type(data), ACCEPTED_TYPES)
+        raise UnsupportedImageTypeError(_other_type(data), accepted_types())
     if header.width_px == 0 or header.height_px == 0:
         _corrupt(header.media_type, "it has no pixels")
     return header
@@ -81,6 +98,8 @@ def read_header(data: bytes) -> ImageHeader:
 
 def _other_type(data: bytes) -> str | None:
     """A name for well-known bytes that are not accepted, for the error's text."""
+    if is_heic(data):
+        return _HEIC_NEEDS
     if data[4:8] == b"ftyp" and (name := _ISO_BRANDS.get(data[8:12])):
         return name
     for magic, name in _OTHER_MAGICS:

@@ -11,7 +11,7 @@ import pytest
 
 from app.schemas import BatchAnswer, PosesAnswer
 from library_store.skeleton import L_HIP, LSP14, R_HIP
-from tests.app.conftest import Render
+from tests.app.conftest import RENDERS, Render
 from tests.app.imaging.test_decode import STORED, encode, png_with_exif, tiff
 from tests.app.server import Server
 
@@ -186,6 +186,16 @@ def test_odd_sizes_are_answered(server: Server, size: tuple[int, int]) -> None:
     assert (answer["image"]["height_px"], answer["image"]["width_px"]) == size
     box = post(server, encode(np.full((*size, 3), 90, np.uint8), ".png"), "box_px=-9,-9,50,90")
     assert len(box["people"]) == 1
+
+
+def test_heic_is_answered(server: Server, renders: list[Render]) -> None:
+    """The same person as in the JPEG, within what the coarser compression moves joints."""
+    data = (RENDERS / "000.heic").read_bytes()
+    query = f"box_px={renders[0].box_px()}"
+    (person,) = post(server, data, query)["people"]
+    (original,) = post(server, renders[0].data, query)["people"]
+    distance = np.linalg.norm(joints_px(person) - joints_px(original), axis=1)
+    assert np.median(distance) < 4
 
 
 def test_batch(server: Server, renders: list[Render]) -> None:

@@ -93,6 +93,7 @@ def test_openapi_is_whole_and_its_examples_hold(server: Server) -> None:
         "image/jpeg",
         "image/png",
         "image/webp",
+        "image/heic",
         "multipart/form-data",
     }
     assert {"200", "400", "401", "408", "413", "415", "422", "429", "503"} == set(
