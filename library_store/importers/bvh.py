@@ -16,26 +16,21 @@ from pathlib import Path
 
 import numpy as np
 
-from library_store.anatomy import root_of
 from library_store.importers.asf_amc import CMU_LICENCE, describe_cmu
 from library_store.importers.checks import checked
 from library_store.importers.clip import Clip, Float, MocapError
-from library_store.importers.joint_tables import JointTable, find_table, plain, read_mapping
-from library_store.importers.rotation import euler
-from library_store.skeleton import (
-    HEAD_TOP,
-    L_ELBOW,
-    L_SHOULDER,
-    L_WRIST,
-    LSP14,
-    R_ELBOW,
-    R_SHOULDER,
-    R_WRIST,
+from library_store.importers.head import HEAD_PER_TRUNK, put_head_top
+from library_store.importers.joint_tables import (
+    JointMapping,
+    JointTable,
+    find_table,
+    plain,
+    read_mapping,
 )
+from library_store.importers.rotation import euler
+from library_store.skeleton import HEAD_TOP, L_WRIST, LSP14, R_WRIST
 
 _ZERO = 1e-6
-_JUMP = 4.0
-_STRAIGHT = 0.97
 
 
 @dataclass(frozen=True)
@@ -62,27 +57,16 @@ class BvhFile:
 
 
 def read(path: Path, *, mapping: Path | None = None) -> Clip:
-    """The clip of a BVH file; ``mapping`` is a JSON table for joint names that are not known."""
+    """The clip of a BVH file; ``mapping`` is a table for joint names that are not known."""
     bvh = parse(path)
-    table = _table_for(path, bvh, mapping)
-    bvh, findings = restore_thorax(bvh, table)
-    joints = world_positions(bvh)
-    numbers = [bvh.index(target) for target in table.targets]
-    positions = joints[:, numbers]
-    for joint, stretch in (
-        (HEAD_TOP, table.head_stretch),
-        (R_WRIST, table.wrist_stretch),
-        (L_WRIST, table.wrist_stretch),
-    ):
-        start = joints[:, bvh.joints[numbers[joint]].parent]
-        positions[:, joint] = start + stretch * (positions[:, joint] - start)
-    if table.wrist_stretch != 1.0:
-        findings.append("wrist bones, half as long as the radius, put back")
+    if mapping is not None:
+        given = read_mapping(mapping)
+        table = JointTable(name=given.name, targets=())
+        positions, findings = _mapped(path, bvh, given), list[str]()
+    else:
+        table = _table_for(path, bvh)
+        positions, findings = _by_table(bvh, table)
     frames = np.arange(len(positions), dtype=np.int64)
-    if starts_with_t_pose(positions):
-        findings.append("the first frame is a T-pose: dropped")
-        positions, frames = positions[1:], frames[1:]
-
     rate = 1.0 / bvh.frame_time_s
     subject = action = ""
     if table.is_cmu:
@@ -187,21 +171,47 @@ def world_positions(bvh: BvhFile) -> Float:
     return places
 
 
-def _table_for(path: Path, bvh: BvhFile, mapping: Path | None) -> JointTable:
+def _mapped(path: Path, bvh: BvhFile, mapping: JointMapping) -> Float:
+    """The joints (F, 14, 3) that a user's table names."""
+    names = [plain(joint.name) for joint in bvh.joints]
+    wanted = [[plain(name) for name in targets] for targets in mapping.targets]
+    missing = sorted({name for targets in wanted for name in targets} - set(names))
+    if missing:
+        raise MocapError(path, f"has no joints {', '.join(missing)}, which {mapping.name} names")
+    joints = world_positions(bvh)
+    return np.stack([joints[:, [names.index(n) for n in t]].mean(axis=1) for t in wanted], axis=1)
+
+
+def _by_table(bvh: BvhFile, table: JointTable) -> tuple[Float, list[str]]:
+    """The joints (F, 14, 3) of a known table, with what the conversion lost put back; findings."""
+    bvh, findings = restore_thorax(bvh, table)
+    joints = world_positions(bvh)
+    numbers = [bvh.index(target) for target in table.targets]
+    positions = joints[:, numbers]
+    for joint, stretch in (
+        (HEAD_TOP, table.head_stretch),
+        (R_WRIST, table.wrist_stretch),
+        (L_WRIST, table.wrist_stretch),
+    ):
+        start = joints[:, bvh.joints[numbers[joint]].parent]
+        positions[:, joint] = start + stretch * (positions[:, joint] - start)
+    if table.wrist_stretch != 1.0:
+        findings.append("wrist bones, half as long as the radius, put back")
+    if table.head_is_base:
+        positions, _ = put_head_top(positions)
+        findings.append(f"head top at {HEAD_PER_TRUNK} of the trunk beyond the neck assumed")
+    return positions, findings
+
+
+def _table_for(path: Path, bvh: BvhFile) -> JointTable:
     names = frozenset(plain(joint.name) for joint in bvh.joints)
-    if mapping is not None:
-        table = read_mapping(mapping)
-        missing = sorted(set(table.targets) - names)
-        if missing:
-            raise MocapError(path, f"has no joints {', '.join(missing)}, which {mapping} names")
-        return table
     found = find_table(names, coinciding=_coinciding(bvh))
     if found is None:
         listed = ", ".join(joint.name for joint in bvh.joints)
         raise MocapError(
             path,
-            f"joint names not known: {listed}. Give a mapping file, a JSON object from each of "
-            f"{', '.join(LSP14.joint_names)} to one of these names",
+            f"joint names not known: {listed}. Give a mapping file, a JSON or TOML table from each "
+            f"of {', '.join(LSP14.joint_names)} to one of these names, or a list of them",
         )
     return found
 
@@ -230,18 +240,3 @@ def restore_thorax(bvh: BvhFile, table: JointTable) -> tuple[BvhFile, list[str]]
     length_mm = offset[1] * (table.mm_per_unit or 1.0)
     finding = f"thorax of {length_mm:.0f} mm above {bvh.joints[back].name} put back"
     return replace(bvh, joints=joints), [finding]
-
-
-def starts_with_t_pose(positions: Float) -> bool:
-    """Whether the first frame of (F, 14, 3) has straight arms and jumps to the second."""
-    if len(positions) < 3:
-        return False
-    centred = positions - root_of(positions)[:, None]
-    steps = np.linalg.norm(np.diff(centred, axis=0), axis=-1).mean(axis=1)
-    for shoulder, elbow, wrist in ((R_SHOULDER, R_ELBOW, R_WRIST), (L_SHOULDER, L_ELBOW, L_WRIST)):
-        first = positions[0]
-        bones = np.linalg.norm(first[elbow] - first[shoulder])
-        bones += np.linalg.norm(first[wrist] - first[elbow])
-        if np.linalg.norm(first[wrist] - first[shoulder]) < _STRAIGHT * bones:
-            return False
-    return bool(steps[0] > _JUMP * max(float(np.percentile(steps[1:], 95)), 1e-12))

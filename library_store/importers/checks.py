@@ -4,6 +4,7 @@ Every importer hands its clip to ``checked``. Each mend and each doubt becomes a
 in ``Clip.findings``; poses that no known mistake explains raise ``MocapError``. In this order:
 
 *frames with numbers that are not finite* are dropped;
+*a T-pose as the first frame*, with straight arms and a jump to the second, is dropped;
 *units*: trunk + thigh + shank of a standing adult is 1.37 m; a clip that is off by the ratio of
 metres, centimetres, inches, feet or CMU's units is scaled, one that fits none is refused;
 *glitches*: frames in which a bone is 30% off its usual length, or a joint jumps out and back faster
@@ -25,15 +26,22 @@ from numpy.typing import NDArray
 
 from library_store.anatomy import LENGTHS, measure_lengths, root_of, unit
 from library_store.importers.clip import Clip, Float, Frames, MocapError
+from library_store.importers.rotation import up_to_y
 from library_store.skeleton import (
     L_ANKLE,
+    L_ELBOW,
     L_HIP,
     L_KNEE,
+    L_SHOULDER,
+    L_WRIST,
     LSP14,
     NECK,
     R_ANKLE,
+    R_ELBOW,
     R_HIP,
     R_KNEE,
+    R_SHOULDER,
+    R_WRIST,
 )
 
 ADULT_MM = 1370.0
@@ -52,6 +60,9 @@ _PLAUSIBLE_SCALED = (0.78, 1.25)
 BONE_TOLERANCE = 0.3
 MAX_SPEED_MM_S = 15_000.0
 _MAX_LOST = 0.5
+
+_JUMP = 4.0
+_STRAIGHT = 0.97
 
 _STANDS = 0.85
 _BENT_MM = 30.0
@@ -84,6 +95,9 @@ def checked(
     if not keep.any():
         raise MocapError(path, f"clip {clip.name!r} has no frame with all 14 joints")
     positions, frames = positions[keep], clip.frames[keep]
+    if starts_with_t_pose(positions):
+        findings.append("the first frame is a T-pose: dropped")
+        positions, frames = positions[1:], frames[1:]
     if np.abs(positions).max() > 1e9:
         raise MocapError(path, f"clip {clip.name!r} has coordinates beyond any unit of length")
 
@@ -118,6 +132,21 @@ def checked(
         frames=frames,
         findings=tuple(dict.fromkeys(findings)),  # those of an earlier import only once
     )
+
+
+def starts_with_t_pose(positions: Float) -> bool:
+    """Whether the first frame of (F, 14, 3) has straight arms and jumps to the second."""
+    if len(positions) < 3:
+        return False
+    centred = positions - root_of(positions)[:, None]
+    steps = np.linalg.norm(np.diff(centred, axis=0), axis=-1).mean(axis=1)
+    for shoulder, elbow, wrist in ((R_SHOULDER, R_ELBOW, R_WRIST), (L_SHOULDER, L_ELBOW, L_WRIST)):
+        first = positions[0]
+        bones = np.linalg.norm(first[elbow] - first[shoulder])
+        bones += np.linalg.norm(first[wrist] - first[elbow])
+        if np.linalg.norm(first[wrist] - first[shoulder]) < _STRAIGHT * bones:
+            return False
+    return bool(steps[0] > _JUMP * max(float(np.percentile(steps[1:], 95)), 1e-12))
 
 
 def unit_scale(positions: Float) -> tuple[float | None, str]:
@@ -170,10 +199,7 @@ def up_rotation(positions_mm: Float, *, up_is_known: bool) -> tuple[Float, str]:
     if up_is_known or abs(stance[axis]) < _STANDS:
         lying = "people mostly lie, are upside down, or the up axis is not Y"
         return np.eye(3), f"{lying} (ankles to neck is along {name}); left as it is"
-    up = np.zeros(3)
-    up[axis] = np.sign(stance[axis])
-    x = np.array([0.0, 1.0, 0.0]) if axis == 0 else np.array([1.0, 0.0, 0.0])
-    return np.stack([x, up, np.cross(x, up)]), f"people stand along {name}: turned so that Y is up"
+    return up_to_y(name), f"people stand along {name}: turned so that Y is up"
 
 
 def sides_are_swapped(positions_mm: Float) -> bool:

@@ -24,28 +24,28 @@ from typing import Any
 
 import numpy as np
 
-from library_store.anatomy import root_of, unit
 from library_store.importers.checks import checked
 from library_store.importers.clip import Clip, Float, Frames, MocapError
+from library_store.importers.h36m import H36M_32, H36M_HZ, H36M_LICENCE
+from library_store.importers.head import put_head_top
+from library_store.importers.rotation import up_to_y
 from library_store.importers.safe_npz import NpzFile
-from library_store.skeleton import HEAD_TOP, LSP14, NECK
+from library_store.skeleton import LSP14
 
-H36M_32 = (15, 13, 25, 26, 27, 17, 18, 19, 1, 2, 3, 6, 7, 8)
 H36M_17 = (10, 8, 14, 15, 16, 11, 12, 13, 1, 2, 3, 4, 5, 6)
 HUMANEVA_15 = (14, 1, 5, 6, 7, 2, 3, 4, 11, 12, 13, 8, 9, 10)
 SMPL = (15, 12, 17, 19, 21, 16, 18, 20, 2, 5, 8, 1, 4, 7)
 """Index of each lsp14 joint in the other skeletons."""
 
-H36M_HZ, HUMANEVA_HZ = 50.0, 60.0
-HEAD_PER_TRUNK = 0.47
+HUMANEVA_HZ = 60.0
 _MM_PER_M = 1000.0
 
 _CLIP_COLUMNS = ("name", "subject", "action", "fps", "findings", "license")
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 
 _NESTED = {
-    32: ("Human3.6M", H36M_32, H36M_HZ, "Human3.6M licence: academic use only"),
-    17: ("Human3.6M", H36M_17, H36M_HZ, "Human3.6M licence: academic use only"),
+    32: ("Human3.6M", H36M_32, H36M_HZ, H36M_LICENCE),
+    17: ("Human3.6M", H36M_17, H36M_HZ, H36M_LICENCE),
     15: ("HumanEva", HUMANEVA_15, HUMANEVA_HZ, "HumanEva licence: research use only"),
 }
 
@@ -183,10 +183,7 @@ def _read_smpl(path: Path, npz: NpzFile) -> Clip:
     if joints.ndim != 3 or joints.shape[1] < 22 or joints.shape[2] != 3:
         raise MocapError(path, f"joints are {joints.shape}; wanted is (F, 22 or more, 3)")
     positions, _ = _with_y_up(path, joints[:, SMPL] * _MM_PER_M, "Z")
-    neck = positions[:, NECK]
-    trunk = np.linalg.norm(neck - root_of(positions), axis=-1)
-    reach = HEAD_PER_TRUNK * float(np.median(trunk))
-    positions[:, HEAD_TOP] = neck + reach * unit(positions[:, HEAD_TOP] - neck)
+    positions, reach = put_head_top(positions)
     rate = next((name for name in _RATES if name in npz), "fps")
     clip = Clip(
         name=path.stem,
@@ -202,12 +199,13 @@ def _read_smpl(path: Path, npz: NpzFile) -> Clip:
 
 def _with_y_up(path: Path, positions: Float, up_axis: str) -> tuple[Float, bool]:
     """Positions turned so that Y is up, and whether the up axis was known."""
-    if up_axis == "Z":
-        turned: Float = positions[..., [0, 2, 1]] * (1.0, 1.0, -1.0)
-        return turned, True
-    if up_axis not in ("", "Y"):
-        raise MocapError(path, f"up_axis {up_axis!r} is not supported; Y or Z")
-    return positions, up_axis == "Y"
+    if not up_axis:
+        return positions, False
+    try:
+        turned: Float = positions @ up_to_y(up_axis).T
+    except ValueError as error:
+        raise MocapError(path, f"up_axis: {error}") from error
+    return turned, True
 
 
 def _numbers(path: Path, name: str, values: Any) -> Float:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
-from library_store.importers import asf_amc, bvh, npz
+from library_store.importers import asf_amc, bvh, c3d, h36m, npz
 from library_store.importers.clip import Clip, MocapError
 
-SUFFIXES = (".amc", ".bvh", ".npz")
+SUFFIXES = (".amc", ".bvh", ".c3d", ".cdf", ".npz")
 
 
 def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
-    """The clips of one file; ``mapping`` is a JSON joint table for BVH files of other names.
+    """The clips of one file; ``mapping`` is a table for BVH joints or C3D markers of other names.
 
     Raises ``MocapError`` for a file that is missing, malformed or of a person no unit fits; nothing
     of such a file is returned.
@@ -20,6 +20,8 @@ def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
     importers: dict[str, Callable[[], list[Clip]]] = {
         ".amc": lambda: [asf_amc.read(path)],
         ".bvh": lambda: [bvh.read(path, mapping=mapping)],
+        ".c3d": lambda: c3d.read(path, mapping=mapping),
+        ".cdf": lambda: [h36m.read(path)],
         ".npz": lambda: npz.read(path),
     }
     importer = importers.get(path.suffix.lower())

@@ -30,3 +30,19 @@ def euler(axes: str, degrees: Float) -> Float:
     for i, axis in enumerate(axes):
         matrix = matrix @ about_axis(axis, degrees[..., i])
     return matrix
+
+
+def up_to_y(up: str) -> Float:
+    """The rotation (3, 3) that takes the axis ``up``, one of "+X", "-X" ... "Z", to +Y.
+
+    Raises ``ValueError`` for anything else.
+    """
+    sign, letter = up[:-1], up[-1:].upper()
+    if sign not in ("", "+", "-") or letter not in ("X", "Y", "Z"):
+        raise ValueError(f"{up!r} is not an axis such as +Z")
+    if letter == "Y" and sign != "-":
+        return np.eye(3)
+    y = np.zeros(3)
+    y["XYZ".index(letter)] = -1.0 if sign == "-" else 1.0
+    x = np.array([0.0, 1.0, 0.0]) if letter == "X" else np.array([1.0, 0.0, 0.0])
+    return np.stack([x, y, np.cross(x, y)])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 
 from library_store.anatomy import Float
@@ -206,6 +209,14 @@ def cmu_bvh(motion: Motion, *, max_names: bool = False) -> str:
         values = np.vstack([t_pose, values])
     lines = "\n".join(" ".join(f"{v:.7f}" for v in row) for row in values)
     return f"HIERARCHY\n{hierarchy}MOTION\nFrames: {len(values)}\nFrame Time: .0083333\n{lines}\n"
+
+
+def nested(path: Path, value: Any) -> Path:
+    """An npz whose ``positions_3d`` is an object array that holds ``value``."""
+    holder = np.empty((), dtype=object)
+    holder[()] = value
+    np.savez_compressed(path, positions_3d=holder)
+    return path
 
 
 def people(n: int = 40, seed: int = 5) -> Float:

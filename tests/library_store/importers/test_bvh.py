@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -11,8 +12,8 @@ from numpy.testing import assert_allclose
 from library_store.anatomy import Float, root_of
 from library_store.importers import Clip, MocapError, read
 from library_store.importers.bvh import parse, world_positions
-from library_store.importers.joint_tables import TABLES
-from library_store.skeleton import LSP14
+from library_store.importers.joint_tables import TABLES, plain
+from library_store.skeleton import HEAD_TOP, LSP14, NECK
 from tests.library_store.importers.files import ASF, amc, cmu_bvh, walk
 
 TOLERANCE_MM = 0.05
@@ -42,6 +43,22 @@ def test_it_agrees_with_asf_and_amc_of_the_same_clip(tmp_path: Path, max_names: 
         assert "the first frame is a T-pose: dropped" in clip.findings
         assert_allclose(clip.frames, truth.frames)
     assert (clip.subject, clip.frame_rate_hz) == ("cmu_02", 120.0)
+
+
+REAL = Path(os.environ.get("CMU_MOCAP_RAW", "."))
+
+
+@pytest.mark.skipif(
+    not (REAL / "cmu_bvh_cgspeed").is_dir(), reason="set CMU_MOCAP_RAW to CMU's raw files"
+)
+@pytest.mark.parametrize("name", ["02_01", "05_13", "35_01", "49_18"])
+def test_real_conversions_agree_with_asf_and_amc(name: str) -> None:
+    (clip,) = read(REAL / "cmu_bvh_cgspeed" / f"{name}.bvh")
+    (truth,) = read(REAL / "cmu_asfamc" / name[:2] / f"{name}.amc")
+    n = min(len(clip), len(truth))
+    error = np.linalg.norm(centred(clip)[:n] - centred(truth)[:n], axis=-1)
+    assert error.mean() < 4.0
+    assert error.max() < 12.0
 
 
 def test_a_rate_that_contradicts_the_index_is_reported(tmp_path: Path) -> None:
@@ -115,9 +132,28 @@ def test_unknown_names_are_listed_and_a_mapping_file_helps(tmp_path: Path) -> No
     assert any("wrist bone missing" in finding for finding in clip.findings)
 
 
+def test_a_mapping_file_in_toml_with_means(tmp_path: Path) -> None:
+    text = re.sub(r"(ROOT|JOINT) (\w+)", r"\1 my\2", cmu_bvh(walk()))
+    path = write(tmp_path / "dance.bvh", text)
+    own = dict(zip(LSP14.joint_names, TABLES[0].targets, strict=True))
+    one = "".join(f'{joint} = "my{name}"\n' for joint, name in own.items())
+    (clip,) = read(path, mapping=write(tmp_path / "one.toml", one))
+    lines = one.replace('neck = "myneck1"', 'neck = ["myNeck1", "mySpine1"]')
+    assert lines != one
+    (mean,) = read(path, mapping=write(tmp_path / "mean.toml", lines))
+    neck = LSP14.index("neck")
+    others = [joint for joint in range(14) if joint != neck]
+    assert_allclose(mean.positions_mm[:, others], clip.positions_mm[:, others], atol=0.01)
+    lower = clip.positions_mm[:, neck, 1] - mean.positions_mm[:, neck, 1]
+    assert np.all((lower > 20.0) & (lower < 120.0)), "half of the way from Spine1 to Neck1"
+    with pytest.raises(MocapError, match="has no joints mynose"):
+        read(path, mapping=write(tmp_path / "bad.toml", one.replace("myneck1", "mynose")))
+
+
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
+        ('{"neck": 3}', "joints missing"),
         ("{", "JSON"),
         ("[1]", "object"),
         ('{"neck": "Neck"}', "joints missing: head_top"),
@@ -132,7 +168,60 @@ def test_a_bad_mapping_file_is_named(tmp_path: Path, content: str, problem: str)
     assert str(mapping) in str(caught.value)
 
 
-def test_mixamo_names_in_centimetres(tmp_path: Path) -> None:
+LIMBS = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
+BLENDER = ("upper_arm", "forearm", "hand", "thigh", "shin", "foot")
+BIPED = ("UpperArm", "Forearm", "Hand", "Thigh", "Calf", "Foot")
+
+
+def renamed(pattern: str, limbs: tuple[str, ...], sides: tuple[str, str]) -> str:
+    """The walk under other joint names; no thorax is lost, as far as names tell."""
+    text = cmu_bvh(walk()).replace("Spine1", "Spine2").replace("Neck1", "Neck9")
+    for side, other in zip(("Right", "Left"), sides, strict=True):
+        for limb, new in zip(LIMBS, limbs, strict=True):
+            name = pattern.format(side=other, limb=new)
+            text = re.sub(rf"(ROOT|JOINT) {side}{limb}\b", rf"\1 {name}", text)
+    return text
+
+
+@pytest.mark.parametrize(
+    ("table", "pattern", "limbs", "sides"),
+    [
+        ("MotionBuilder", "mixamorig:{side}{limb}", LIMBS, ("Right", "Left")),
+        ("MotionBuilder", "mixamorig1_{side}{limb}", LIMBS, ("Right", "Left")),
+        ("MotionBuilder", "Ann|{side}{limb}", LIMBS, ("Right", "Left")),
+        ("Blender", "{limb}.{side}", BLENDER, ("R", "L")),
+        ("Blender", "DEF-{limb}_{side}", BLENDER, ("R", "L")),
+        ("Character Studio biped", "Bip01 {side} {limb}", BIPED, ("R", "L")),
+    ],
+)
+def test_names_of_other_programs(
+    tmp_path: Path, table: str, pattern: str, limbs: tuple[str, ...], sides: tuple[str, str]
+) -> None:
+    (truth,) = read(write(tmp_path / "walk.bvh", cmu_bvh(walk())))
+    (clip,) = read(write(tmp_path / "a.bvh", renamed(pattern, limbs, sides)))
+    assert clip.findings[0] == f"joint names: {table}"
+    assert (clip.subject, clip.licence) == ("", "")
+    legs = slice(LSP14.index("r_hip"), None)
+    assert_allclose(centred(clip)[:, legs], centred(truth)[:, legs], atol=0.05)
+
+
+def test_a_head_without_its_top(tmp_path: Path) -> None:
+    """Of Mixamo as some exporters write it: other bones hang on the head, it has no end site."""
+    text = renamed("mixamorig:{side}{limb}", LIMBS, ("Right", "Left"))
+    head = text.index("JOINT Head")
+    end = text.index("End Site", head)
+    jaw = "JOINT Jaw\n{\nOFFSET 0 0.5 0.5\nCHANNELS 0\nEnd Site\n{\nOFFSET 0 0 1\n}\n}\n"
+    close = text.index("}", end) + 1
+    (clip,) = read(write(tmp_path / "a.bvh", text[:end] + jaw + text[close:]))
+    assert clip.findings[0] == "joint names: MotionBuilder, no head top"
+    assert "head top at 0.47 of the trunk beyond the neck assumed" in clip.findings
+    positions = clip.positions_mm.astype(np.float64)
+    head_mm = np.linalg.norm(positions[:, HEAD_TOP] - positions[:, NECK], axis=1)
+    trunk_mm = np.linalg.norm(positions[:, NECK] - root_of(positions), axis=1)
+    assert_allclose(head_mm, 0.47 * np.median(trunk_mm), rtol=2e-3)
+
+
+def test_mixamo_with_a_head_top_in_centimetres(tmp_path: Path) -> None:
     text = cmu_bvh(walk()).replace("Spine1", "Spine2").replace("Neck1", "Neck2")
     text = re.sub(r"(ROOT|JOINT) (\w+)", r"\1 mixamorig:\2", text)
     end = text.index("End Site", text.index("mixamorig:Head"))
@@ -142,10 +231,17 @@ def test_mixamo_names_in_centimetres(tmp_path: Path) -> None:
     text = text[:end] + top + text[close + 1 :]
     (clip,) = read(write(tmp_path / "mixamo.bvh", text))
     assert clip.findings[0] == "joint names: Mixamo"
-    assert clip.subject == ""
+    scaled = re.sub(
+        r"OFFSET (\S+) (\S+) ([^\s}]+)",
+        lambda found: "OFFSET " + " ".join(f"{float(v) * 2.54 / 0.45:.9f}" for v in found.groups()),
+        text,
+    )
+    (again,) = read(write(tmp_path / "centimetres.bvh", scaled))
+    assert any("centimetres" in finding for finding in again.findings)
+    assert_allclose(centred(again), centred(clip), atol=0.05)
 
 
 def test_every_table_has_fourteen_joints() -> None:
     assert all(len(set(table.targets)) == LSP14.n_joints for table in TABLES)
     for table in TABLES:
-        assert all(target == target.lower() for target in table.targets)
+        assert all(target == plain(target) for target in table.targets)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from library_store.anatomy import Float, root_of
+from library_store.anatomy import Float, root_of, unit
 from library_store.importers import Clip, MocapError
 from library_store.importers.checks import MM_PER_UNIT, checked
 from library_store.skeleton import (
@@ -126,6 +126,23 @@ def test_glitches_are_dropped(standing: Float) -> None:
     mixed[1::4, L_ELBOW] += 900.0
     with pytest.raises(MocapError, match="no one skeleton"):
         checked(FILE, clip_of(mixed))
+
+
+def test_a_t_pose_as_the_first_frame_is_dropped(standing: Float) -> None:
+    """Left by conversions, also once they are packed as arrays."""
+    t_pose = standing[0].copy()
+    for shoulder, elbow, wrist in ((2, 3, 4), (5, 6, 7)):
+        out = unit(t_pose[shoulder] - t_pose[7 - shoulder])
+        upper = np.linalg.norm(t_pose[elbow] - t_pose[shoulder])
+        fore = np.linalg.norm(t_pose[wrist] - t_pose[elbow])
+        t_pose[elbow] = t_pose[shoulder] + upper * out
+        t_pose[wrist] = t_pose[elbow] + fore * out
+    clip = checked(FILE, clip_of(np.concatenate([t_pose[None], standing])))
+    assert clip.findings == ("the first frame is a T-pose: dropped",)
+    assert_allclose(clip.positions_mm, standing, atol=0.01)
+    assert clip.frames[0] == 1
+    still = np.stack([t_pose] * 10)
+    assert len(checked(FILE, clip_of(still))) == 10, "somebody who stands so all the time"
 
 
 def test_missing_wrist_and_thorax_are_noticed(standing: Float) -> None:

@@ -1,0 +1,193 @@
+"""C3D: the positions of markers in every frame, with names, units and axes among the parameters.
+
+The marker sets of :mod:`library_store.importers.markers` are known; for others a mapping file says
+which marker, or the mean of which markers, each joint is. A file may hold several people, told
+apart by the prefix of their markers (``Ann:LFHD``): each becomes a clip. Gaps of up to a tenth of a
+second are filled along straight lines; frames with longer ones are dropped.
+
+Reading needs ezc3d, of the extra ``mocap``.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from library_store.importers.asf_amc import CMU_LICENCE, describe_cmu
+from library_store.importers.checks import checked
+from library_store.importers.clip import Clip, Float, MocapError
+from library_store.importers.joint_tables import JointMapping, read_mapping
+from library_store.importers.markers import (
+    MARKER_SETS,
+    Sizes,
+    fill_gaps,
+    find_marker_set,
+    joint_centres,
+    sizes_from,
+)
+from library_store.importers.rotation import up_to_y
+
+LONGEST_GAP_S = 0.1
+
+_MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
+_CMU = MARKER_SETS[0].name
+_MIPS = bytes([86])
+"""The processor type whose numbers have their high byte first."""
+_MANY = 65_535
+"""The header cannot count further; longer files are not held against it."""
+
+
+@dataclass(frozen=True)
+class C3dFile:
+    """A parsed file: the tracks (F, 3) of each person's markers in mm, NaN where not seen.
+
+    ``first`` is the first frame's number, ``up`` the axis that is up, e.g. "+Z", empty where the
+    file does not say it; ``stated`` are numbers that Plug-in Gait leaves, the person's sizes.
+    """
+
+    people: dict[str, dict[str, Float]]
+    first: int
+    rate_hz: float
+    up: str
+    stated: dict[str, float]
+    findings: tuple[str, ...]
+
+
+def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
+    """The clips of a C3D file, one a person; ``mapping`` is a table from joint to markers."""
+    table = read_mapping(mapping) if mapping else None
+    file = parse(path)
+    clips = []
+    for person, markers in file.people.items():
+        named = _joints_of(markers, table, sizes_from(file.stated), file.rate_hz)
+        if named is None:
+            continue
+        joints, marker_set, findings = named
+        subject = action = ""
+        if marker_set == _CMU:
+            subject, action, _, _ = describe_cmu(path)
+        if file.up:
+            joints = joints @ up_to_y(file.up).T
+        clip = Clip(
+            name=path.stem if len(file.people) == 1 else f"{path.stem}_{person}".rstrip("_"),
+            subject=subject or person,
+            action=action,
+            frame_rate_hz=file.rate_hz,
+            positions_mm=joints.astype(np.float32),
+            frames=np.arange(file.first, file.first + len(joints), dtype=np.int64),
+            findings=(f"markers: {marker_set}", *file.findings, *findings),
+            licence=CMU_LICENCE if subject else "",
+        )
+        clips.append(checked(path, clip, up_is_known=bool(file.up)))
+    if not clips:
+        there = ", ".join(f"{p}:{m}" if p else m for p, ms in file.people.items() for m in ms)
+        known = "; ".join(f"{known.name} ({' '.join(known.markers)})" for known in MARKER_SETS)
+        raise MocapError(
+            path,
+            f"markers are {there[:500] or 'none'}. Known sets are {known}. Others need a mapping "
+            "file: a JSON or TOML table from each joint to a marker or a list of markers",
+        )
+    return clips
+
+
+def parse(path: Path) -> C3dFile:
+    """Read a C3D file; ``MocapError`` where it is not a whole one or ezc3d is not installed."""
+    try:
+        from ezc3d import c3d
+    except ImportError as error:
+        raise MocapError(
+            path, "C3D files need ezc3d: install posematch with its extra, posematch[mocap]"
+        ) from error
+    if not path.is_file():
+        raise FileNotFoundError(2, "No such file", str(path))
+    try:
+        content = c3d(str(path))
+        parameters = content["parameters"]
+        point = parameters["POINT"]
+        points = np.asarray(content["data"]["points"][:3], dtype=np.float64).transpose(1, 2, 0)
+        first, last = _frame_range(path)
+        names = [
+            str(name).strip()
+            for key in ("LABELS", "LABELS2", "LABELS3", "LABELS4")
+            for name in (point[key]["value"] if key in point else ())
+        ]
+        rate_hz = float(point["RATE"]["value"][0])
+    except (OSError, RuntimeError, LookupError, ValueError, MemoryError, struct.error) as error:
+        raise MocapError(path, f"not a whole C3D file: {error}") from error
+    cut = last < _MANY and points.shape[1] != last + 1 - first
+    if cut or len(names) < len(points) or not points.size:
+        raise MocapError(
+            path,
+            f"not a whole C3D file: {last + 1 - first} frames announced, {points.shape[1]} found; "
+            f"{len(points)} markers with {len(names)} names",
+        )
+    unit = _text(point, "UNITS").lower()
+    findings = () if unit in _MM_PER_UNIT else (f"unit of length {unit!r}: mm assumed",)
+    people: dict[str, dict[str, Float]] = {}
+    for name, track in zip(names, points * _MM_PER_UNIT.get(unit, 1.0), strict=False):
+        person, _, marker = name.rpartition(":")
+        people.setdefault(person, {}).setdefault(marker.upper(), track)
+    stated = parameters.get("PROCESSING", {})
+    return C3dFile(
+        people=people,
+        first=first,
+        rate_hz=rate_hz if rate_hz > 0.0 else float("nan"),
+        up=_text(point, "Y_SCREEN").upper(),
+        stated={name: _number(stated, name) for name in stated},
+        findings=findings,
+    )
+
+
+def _joints_of(
+    markers: Mapping[str, Float], table: JointMapping | None, sizes: Sizes, rate_hz: float
+) -> tuple[Float, str, list[str]] | None:
+    """Joints (F, 14, 3), the name of the set, findings; None where the markers are not those."""
+    marker_set = find_marker_set(frozenset(markers))
+    if table is not None:
+        wanted = tuple(name.upper() for targets in table.targets for name in targets)
+        name = table.name
+    elif marker_set is not None:
+        wanted, name = marker_set.markers, marker_set.name
+    else:
+        return None
+    if not set(wanted).issubset(markers):
+        return None
+    longest = round(LONGEST_GAP_S * rate_hz) if np.isfinite(rate_hz) else 0
+    filled = {marker: fill_gaps(markers[marker], longest) for marker in wanted}
+    n_filled = sum(
+        int(np.isnan(markers[marker][:, 0]).sum() - np.isnan(filled[marker][:, 0]).sum())
+        for marker in filled
+    )
+    findings = [f"{n_filled} marker positions in short gaps filled"] if n_filled else []
+    if table is not None:
+        means = [np.mean([filled[m.upper()] for m in targets], axis=0) for targets in table.targets]
+        return np.stack(means, axis=1), name, findings
+    assert marker_set is not None
+    return joint_centres(marker_set, filled, sizes), name, findings
+
+
+def _frame_range(path: Path) -> tuple[int, int]:
+    """Numbers of the first and last frame by the header, which ezc3d mends where a file is cut."""
+    with path.open("rb") as file:
+        header = file.read(512)
+        file.seek(512 * (header[0] - 1) + 3)
+        processor = file.read(1)
+    first, last = struct.unpack_from(">HH" if processor == _MIPS else "<HH", header, 6)
+    return first, last
+
+
+def _text(group: Any, name: str) -> str:
+    values = group[name]["value"] if name in group else []
+    return str(values[0]).strip() if len(values) else ""
+
+
+def _number(group: Any, name: str) -> float:
+    try:
+        return float(group[name]["value"][0])
+    except (KeyError, IndexError, TypeError, ValueError):
+        return 0.0

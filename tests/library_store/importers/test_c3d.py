@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from library_store.anatomy import root_of
+from library_store.importers import MocapError, read
+from library_store.importers.markers import MARKER_SETS, Sizes, joint_centres
+from library_store.importers.rotation import about_axis
+from library_store.skeleton import LSP14
+from tests.library_store.importers.marker_files import standing, turning, write_c3d
+
+TRACKS = turning(standing())
+TRUTH = joint_centres(MARKER_SETS[0], TRACKS, Sizes())
+
+
+def test_markers_become_joints(tmp_path: Path) -> None:
+    (clip,) = read(write_c3d(tmp_path / "05_13.c3d", TRACKS))
+    assert_allclose(clip.positions_mm, TRUTH, atol=0.02)
+    assert clip.findings == ("markers: CMU's 41 markers",)
+    assert (clip.name, clip.subject, clip.frame_rate_hz) == ("05_13", "cmu_05", 120.0)
+    assert "free for all uses" in clip.licence
+    assert clip.frames[0] == 1
+
+
+def test_plug_in_gait_in_metres_with_stated_sizes(tmp_path: Path) -> None:
+    tracks = turning(standing(plug_in_gait=True))
+    path = write_c3d(tmp_path / "gait.c3d", tracks, unit="m", stated={"LKneeWidth": 90.0})
+    (clip,) = read(path)
+    truth = joint_centres(MARKER_SETS[1], tracks, Sizes(knee=90.0))
+    assert_allclose(clip.positions_mm, truth, atol=0.05)
+    assert clip.findings == ("markers: Plug-in Gait",)
+    assert (clip.subject, clip.licence) == ("", "")
+
+
+def test_two_people_are_two_clips(tmp_path: Path) -> None:
+    ann = {f"Ann:{name}": track for name, track in TRACKS.items()}
+    beside = np.array([1000.0, 0.0, 0.0])
+    bob = {f"Bob:{name}": track + beside for name, track in TRACKS.items()}
+    clips = read(write_c3d(tmp_path / "pair.c3d", ann | bob))
+    assert [(clip.name, clip.subject) for clip in clips] == [
+        ("pair_Ann", "Ann"),
+        ("pair_Bob", "Bob"),
+    ]
+    assert_allclose(clips[1].positions_mm, clips[0].positions_mm + beside, atol=0.01)
+
+
+def test_an_axis_that_is_not_stated_is_found(tmp_path: Path) -> None:
+    (clip,) = read(write_c3d(tmp_path / "a.c3d", TRACKS, up=""))
+    assert any("turned so that Y is up" in finding for finding in clip.findings)
+    assert_allclose(clip.positions_mm[..., 1], TRUTH[..., 1], atol=0.02)
+
+
+def test_gaps(tmp_path: Path) -> None:
+    tracks = {name: track.copy() for name, track in TRACKS.items()}
+    tracks["LKNE"][10:15] = np.nan
+    tracks["C7"][30:50] = np.nan
+    (clip,) = read(write_c3d(tmp_path / "a.c3d", tracks))
+    assert "5 marker positions in short gaps filled" in clip.findings
+    assert "20 frames with missing joints dropped" in clip.findings
+    assert clip.frames.tolist() == [*range(1, 31), *range(51, 61)]
+    assert_allclose(clip.positions_mm[:15], TRUTH[:15], atol=0.5)
+
+
+def test_a_mapping_file_from_joint_to_markers(tmp_path: Path) -> None:
+    path = write_c3d(
+        tmp_path / "own.c3d",
+        {f"m{i}": TRUTH[:, i] for i in range(14)} | {"far": TRUTH[:, 4] + (0.0, 0.0, 20.0)},
+    )
+    with pytest.raises(MocapError, match=r"own\.c3d: markers are .*Plug-in Gait.*mapping file"):
+        read(path)
+    table: dict[str, object] = {joint: f"m{i}" for i, joint in enumerate(LSP14.joint_names)}
+    table["r_wrist"] = ["m4", "far"]
+    mapping = tmp_path / "mapping.json"
+    mapping.write_text(json.dumps(table))
+    (clip,) = read(path, mapping=mapping)
+    wrist = LSP14.index("r_wrist")
+    expected = TRUTH.copy()
+    expected[:, wrist, 2] += 10.0
+    assert_allclose(clip.positions_mm, expected, atol=0.02)
+
+
+@pytest.mark.parametrize("size", [0, 100, 700, 5_000])
+def test_a_cut_file_is_refused(tmp_path: Path, size: int) -> None:
+    path = write_c3d(tmp_path / "cut.c3d", TRACKS)
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(MocapError, match=r"cut\.c3d: not a whole C3D file"):
+        read(path)
+
+
+def test_noise_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "noise.c3d"
+    path.write_bytes(np.random.default_rng(0).bytes(5_000))
+    with pytest.raises(MocapError, match=r"noise\.c3d: not a whole C3D file"):
+        read(path)
+
+
+def test_without_the_extra_it_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_c3d(tmp_path / "a.c3d", TRACKS)
+    monkeypatch.setitem(sys.modules, "ezc3d", None)
+    with pytest.raises(MocapError, match=r"posematch\[mocap\]"):
+        read(path)
+
+
+REAL = Path(os.environ.get("CMU_MOCAP_RAW", "."))
+
+
+@pytest.mark.skipif(
+    not (REAL / "cmu_c3d" / "05_13.c3d").is_file(), reason="set CMU_MOCAP_RAW to CMU's raw files"
+)
+def test_a_real_clip_agrees_with_its_asf_and_amc() -> None:
+    """CMU turned the laboratory by 90 degrees when it made the AMC."""
+    (clip,) = read(REAL / "cmu_c3d" / "05_13.c3d")
+    (truth,) = read(REAL / "cmu_asfamc" / "05" / "05_13.amc")
+    poses = [c.positions_mm.astype(np.float64) for c in (clip, truth)]
+    centred = [p - root_of(p)[:, None] for p in poses]
+    error = np.linalg.norm(centred[0] @ about_axis("y", np.array(-90.0)).T - centred[1], axis=-1)
+    assert len(clip) == len(truth)
+    assert error.mean() < 32.0
+    assert error[:, [8, 11]].mean() < 12.0
