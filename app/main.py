@@ -8,22 +8,19 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import json
 import logging
 import signal
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
 
 from fastapi import FastAPI
-from fastapi.openapi.utils import get_openapi
 from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
 
-from app import schemas
 from app.api import exemplars, health, info, lift, metrics, page, poses, problems
 from app.api.deps import Service
+from app.api.openapi import DESCRIPTION, openapi_document
 from app.api.shedding import SheddingMiddleware
 from app.engine import load_engine
 from app.errors import StartupError
@@ -34,15 +31,6 @@ from app.version import VERSION
 logger = logging.getLogger("posematch")
 
 _HERE = Path(__file__).resolve().parent
-
-_DESCRIPTION = """\
-POST a photo, get every person's 2D joints, the matched exemplar, the camera and a 3D skeleton.
-
-**Pixels** are those of the upright photo (EXIF orientation applied), (0, 0) the centre of its
-top-left pixel. **Millimetres** are in the camera frame: x right, y down, z forward. **Left and
-right** are the person's own. A number that is not calibrated is `null`. Errors are
-`application/problem+json` (RFC 9457) with a stable `type`.
-"""
 
 
 def _end_process(error: StartupError) -> None:
@@ -116,9 +104,10 @@ def create_app(
     app = FastAPI(
         title="posematch",
         version=VERSION,
-        description=_DESCRIPTION,
+        description=DESCRIPTION,
         lifespan=lifespan,
         middleware=middleware,
+        docs_url=None,  # ours is in app.api.page: FastAPI's loads its scripts from elsewhere
         redoc_url=None,
     )
     app.state.service = service
@@ -127,41 +116,6 @@ def create_app(
         app.include_router(router.router)
     app.include_router(page.page_router(_HERE / "static"))
 
-    app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
+    document = openapi_document(app)
+    app.openapi = lambda: document  # type: ignore[method-assign]
     return app
-
-
-def _openapi(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document: FastAPI's, with the schemas of the bodies we read ourselves."""
-    if app.openapi_schema is None:
-        document = get_openapi(
-            title=app.title,
-            version=app.version,
-            description=app.description,
-            routes=app.routes,
-        )
-        components = document["components"]["schemas"]
-        for model in (schemas.LiftRequest, schemas.Problem):
-            schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
-            components |= schema.pop("$defs", {})
-            components[model.__name__] = schema
-        for path, kind, media, example in (
-            ("/v1/lift", "requestBody", "application/json", "lift_request"),
-            ("/v1/lift", "responses", "application/json", "lift_answer"),
-            ("/v1/poses", "responses", "application/json", "poses_answer"),
-        ):
-            place = document["paths"][path]["post"][kind]
-            place = place["200"] if kind == "responses" else place
-            place["content"][media]["example"] = _read_example(example)
-        # FastAPI's own validation errors, which here are problems like all others.
-        for name in ("HTTPValidationError", "ValidationError"):
-            components.pop(name, None)
-        for operation in (op for path in document["paths"].values() for op in path.values()):
-            if "HTTPValidationError" in json.dumps(operation["responses"].get("422", {})):
-                del operation["responses"]["422"]
-        app.openapi_schema = document
-    return app.openapi_schema
-
-
-def _read_example(name: str) -> object:
-    return json.loads((_HERE / "examples" / f"{name}.json").read_text())

@@ -1,7 +1,7 @@
-"""GET / and /static: the demo page and its files, from memory, under a strict content policy.
+"""GET /, /docs and /static: the pages and their files, from memory, under strict content policies.
 
-The page is plain ES modules without a build step. It loads nothing from elsewhere and links to
-everything relatively, so that it also works under a path prefix.
+The pages are plain JavaScript without a build step. They load nothing from elsewhere and link to
+everything relatively, so that they also work under a path prefix.
 """
 
 from __future__ import annotations
@@ -43,6 +43,20 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Opener-Policy": "same-origin",
 }
+
+# Swagger UI draws its icons as data: images and styles elements as it makes them.
+_DOCS_POLICY = "; ".join(
+    (
+        "default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self' 'unsafe-inline'",
+        "img-src 'self' data: blob:",
+        "connect-src 'self'",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    )
+)
 
 
 @dataclass(frozen=True)
@@ -88,15 +102,21 @@ def read_assets(directory: Path) -> dict[str, Asset]:
 
 
 def page_router(directory: Path) -> APIRouter:
-    """Routes for the page ``index.html`` in ``directory`` and the files beside it."""
+    """Routes for ``index.html`` and ``docs.html`` in ``directory`` and the files beside them."""
     assets = read_assets(directory)
-    page = assets.pop("index.html")
+    page, docs = assets.pop("index.html"), assets.pop("docs.html")
     router = APIRouter(include_in_schema=False)
 
     @router.api_route("/", methods=["GET", "HEAD"])
     async def get_page(request: Request) -> Response:
         response = page.respond(request)
         response.headers.update(_HEADERS)
+        return response
+
+    @router.api_route("/docs", methods=["GET", "HEAD"])
+    async def get_docs(request: Request) -> Response:
+        response = docs.respond(request)
+        response.headers.update(_HEADERS | {"Content-Security-Policy": _DOCS_POLICY})
         return response
 
     @router.api_route("/static/{path:path}", methods=["GET", "HEAD"])

@@ -46,7 +46,7 @@ def test_without_the_extra_the_refusal_says_so(
     assert "image/heic" not in accepted_types()
     with pytest.raises(UnsupportedImageTypeError, match="`heic` extra") as caught:
         decode_photo(photo, max_pixels=10**6, side_px=1000)
-    assert "image/heic" not in caught.value.extra["accepted_types"]
+    assert "image/heic" not in str(caught.value.extra["accepted_types"])
 
 
 @pytest.mark.parametrize(
