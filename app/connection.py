@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from collections.abc import Callable
 from http import HTTPStatus
 from typing import ClassVar
@@ -26,6 +27,9 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from app.errors import PROBLEM_TYPE_PREFIX
 
 MAX_HEAD_BYTES = 65_536
+_UPGRADE = re.compile(rb"(?im)^Upgrade(?=[ \t]*:)")
+"""Offers of h2c, as Java's client makes with every request, may be ignored (RFC 9110, 7.8), but the
+parser would take the body for the other protocol: it must not see them."""
 
 
 class Connection(HttpToolsProtocol):
@@ -38,6 +42,7 @@ class Connection(HttpToolsProtocol):
         super().connection_made(transport)
         self._timers: dict[str, asyncio.TimerHandle] = {}
         self._head_bytes = 0
+        self._in_body = False
         self._expect("head", self.transport.close)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -48,6 +53,9 @@ class Connection(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Feed the parser; a head may be split over many pieces but not over too many bytes."""
+        if not self._in_body and _UPGRADE.search(data):
+            head, end, rest = data.partition(b"\r\n\r\n")
+            data = _UPGRADE.sub(b"X-Grade", head) + end + rest
         super().data_received(data)
         if "head" in self._timers:
             self._head_bytes += len(data)
@@ -64,11 +72,13 @@ class Connection(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         """The head is complete; the parser calls this."""
         self._arrived("head")
+        self._in_body = True
         super().on_headers_complete()
 
     def on_message_complete(self) -> None:
         """The body is complete; the parser calls this."""
         self._arrived("rest")
+        self._in_body = False
         super().on_message_complete()
 
     def on_response_complete(self) -> None:
@@ -101,11 +111,16 @@ class Connection(HttpToolsProtocol):
             timer.cancel()
 
     def _end(self, status: int, slug: str, detail: str) -> None:
-        """Answer with a problem and close, unless an answer is already under way."""
+        """Answer with a problem and close, unless another answer is due or has begun."""
         if self.transport.is_closing():
             return
-        if self.cycle is None or self.cycle.response_complete:
+        cycle = self.cycle
+        begun = cycle is not None and cycle.response_started and not cycle.response_complete
+        if not begun and not self.pipeline:
             self.transport.write(_encode_problem(HTTPStatus(status), slug, detail))
+        if cycle is not None:
+            cycle.disconnected = True  # what is computed for it has nowhere to go
+            cycle.message_event.set()
         self.transport.close()
 
 
