@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -58,6 +58,10 @@ class DetectorOutput(_Frozen):
     threshold: float = Field(description="least score of a person")
 
 
+Provider = Literal["cuda", "openvino", "cpu"]
+Precision = Literal["fp32", "bf16", "int8"]
+
+
 class ModelCard(_Frozen):
     """The JSON beside a weights file."""
 
@@ -66,13 +70,31 @@ class ModelCard(_Frozen):
     file: str
     sha256: str
     description: str
+    precision: Literal["fp32", "int8"] = Field(
+        "fp32", description="of the file's arithmetic; a provider may run fp32 in bf16"
+    )
+    providers: tuple[Provider, ...] = Field(
+        get_args(Provider), description="what the file is made for and tested with"
+    )
+    cpu_features: tuple[str, ...] = Field(
+        (), description="CPUs without any of these run the file slower than its fp32 twin"
+    )
     parameters: int
     multiply_adds: int = Field(description="per input image or crop of the default size")
+    cost_ms: dict[str, float] = Field(
+        default_factory=dict,
+        description="CPU-ms an input, one thread, by 'provider/precision'; posematch model check",
+    )
     output: Annotated[PoseOutput | DetectorOutput, Field(discriminator="kind")]
     training_data: list[str]
     licence: str
     limits: list[str]
     measured: dict[str, float | str]
+
+    @property
+    def gflop(self) -> float:
+        """Billions of floating-point (or integer) operations an input takes, all convolutions."""
+        return 2 * self.multiply_adds / 1e9
 
 
 def read_card(path: Path) -> ModelCard:
@@ -88,6 +110,11 @@ def read_card(path: Path) -> ModelCard:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "the file"
         raise ModelError(f"model card {path} is not valid at {where}: {first['msg']}") from None
+
+
+def write_card(path: Path, card: ModelCard) -> None:
+    """Write a card as people read it, checked once more."""
+    path.write_text(ModelCard.model_validate(card.model_dump()).model_dump_json(indent=2) + "\n")
 
 
 def read_weights(path: Path, card: ModelCard) -> bytes:

@@ -9,16 +9,16 @@ from __future__ import annotations
 import argparse
 import hashlib
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import onnx
 import torch
-from onnx import helper, numpy_helper
+from onnx import numpy_helper
 from torch import Tensor, nn
 
 from library_store.skeleton import LSP14
-from models.card import DetectorOutput, ModelCard, PoseOutput
+from models.card import WEIGHTS_DIR, DetectorOutput, ModelCard, PoseOutput, write_card
 from models.training.augment import CROP_SCALE
 from models.training.network import (
     ConvolutionalPoseMachine,
@@ -27,35 +27,19 @@ from models.training.network import (
     PersonNetwork,
 )
 from models.training.objective import FINE_SIGMA_CELLS
+from models.training.onnx_graph import HALF, PREFIX, person_model, pose_model
 from models.training.train_people import UNIT_PX
 
+Kind = Literal["cpm", "person"]
 DETECTOR_THRESHOLD = 0.35
+PHOTO_PX = 320
+"""Default for the longer side of the photo that the person network sees."""
 LABELLED = "Leeds Sports Pose Extended (Johnson & Everingham 2011, research use), human labels"
 PHOTOS = "web photos of everyday and sport poses, labels by BlazePose heavy and a mobile CPM"
 SCENES = "whole street and sport scenes, boxes by the BlazePose detector and landmark network"
-
-
-HALF = ".half"
-PREFIX = "network."
-
-
 RESEARCH = (
     "trained partly on images published for research use: judge whether that suits a commercial use"
 )
-
-
-class _FromBytes(nn.Module):
-    """uint8 (N, H, W, 3) BGR -> the network's last maps."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, image: Tensor) -> Tensor:
-        x = image.permute(0, 3, 1, 2).float() * (1 / 127.5) - 1.0
-        out = self.network(x)
-        last: Tensor = out[-1] if isinstance(out, list) else out
-        return last
 
 
 def multiply_adds(network: nn.Module, image: Tensor) -> int:
@@ -75,21 +59,6 @@ def multiply_adds(network: nn.Module, image: Tensor) -> int:
     return total
 
 
-def halve_weights(model: onnx.ModelProto) -> None:
-    """Store large float32 initialisers as float16 behind a Cast, in place."""
-    casts = []
-    for initializer in model.graph.initializer:
-        value = numpy_helper.to_array(initializer)
-        if value.dtype != np.float32 or value.size < 1024:
-            continue
-        name = initializer.name
-        stored = numpy_helper.from_array(value.astype(np.float16), name + HALF)
-        initializer.CopyFrom(stored)
-        casts.append(helper.make_node("Cast", [stored.name], [name], to=onnx.TensorProto.FLOAT))
-    for cast in reversed(casts):
-        model.graph.node.insert(0, cast)
-
-
 def read_weights(path: Path) -> dict[str, Tensor]:
     """The state dict that an exported file was written from (without the batch counters)."""
     weights: dict[str, Tensor] = {}
@@ -98,61 +67,21 @@ def read_weights(path: Path) -> dict[str, Tensor]:
         if name.startswith(PREFIX):
             value = numpy_helper.to_array(initializer).astype(np.float32)
             weights[name.removeprefix(PREFIX)] = torch.from_numpy(value)
-    # Equal tensors are stored once, and a strided block's two last biases always are equal: they
-    # are added up, so they get the same gradient from the same start.
-    for name in [n for n in weights if n.endswith(".b.1.bias")]:
-        block = name.removesuffix(".b.1.bias")
-        if f"{block}.skip.1.weight" in weights:
-            weights.setdefault(f"{block}.skip.1.bias", weights[name])
     return weights
 
 
-def write_onnx(network: nn.Module, example: Tensor, path: Path, axes: dict[int, str]) -> str:
-    """Write ``path`` and return its sha256."""
-    torch.onnx.export(
-        _FromBytes(network).eval(),
-        (example,),
-        str(path),
-        input_names=["image"],
-        output_names=["maps"],
-        dynamic_axes={"image": axes, "maps": {k + (k > 0): f"maps_{v}" for k, v in axes.items()}},
-        opset_version=17,
-        dynamo=False,
-        # Keeps the parameters apart and by their names, so that training can go on from the file;
-        # onnxruntime folds the normalisations into the convolutions when it loads it.
-        training=torch.onnx.TrainingMode.PRESERVE,
-        do_constant_folding=False,
-    )
-    model = onnx.load(str(path))
-    halve_weights(model)
-    onnx.checker.check_model(model)
-    path.write_bytes(model.SerializeToString())
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def main() -> None:
-    """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("network", choices=["cpm", "person"])
-    parser.add_argument("--checkpoint", type=Path, required=True)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "weights")
-    parser.add_argument("--name", help="file name without its suffix; the network's by default")
-    parser.add_argument("--version", required=True)
-    parser.add_argument("--input-px", type=int, help="crop side, or the photo's longer side")
-    args = parser.parse_args()
-
-    state = torch.load(args.checkpoint, map_location="cpu", weights_only=True)
-    name = args.name or args.network
-    args.out.mkdir(parents=True, exist_ok=True)
-    path = args.out / f"{name}.onnx"
-    network: nn.Module
-    output: PoseOutput | DetectorOutput
-    if args.network == "cpm":
-        size = args.input_px or state["size_px"]
-        config = {**state["config"], "blocks": tuple(state["config"]["blocks"])}
-        network = ConvolutionalPoseMachine(CpmConfig(**config))
-        example, axes = torch.zeros(1, size, size, 3, dtype=torch.uint8), {0: "n"}
-        output = PoseOutput(
+def pose_card(network: ConvolutionalPoseMachine, name: str, version: str, size: int) -> ModelCard:
+    """The card of a CPM for crops of ``size`` pixels; its sha256 is for :func:`publish` to fill."""
+    return ModelCard(
+        name=name,
+        version=version,
+        file=f"{name}.onnx",
+        sha256="",
+        description="Convolutional Pose Machine: dense residual backbone, "
+        f"{network.cfg.n_stages} supervised stages at stride 8, last maps at stride 4",
+        parameters=sum(p.numel() for p in network.parameters()),
+        multiply_adds=multiply_adds(network, torch.zeros(1, 3, size, size)),
+        output=PoseOutput(
             kind="pose",
             joint_names=list(LSP14.joint_names),
             input_px=size,
@@ -160,57 +89,105 @@ def main() -> None:
             stride_px=4.0,
             target_sigma_cells=FINE_SIGMA_CELLS,
             maps="logits",
-        )
-        description = (
-            "Convolutional Pose Machine: dense residual backbone, "
-            f"{config['n_stages']} supervised stages at stride 8, last maps at stride 4"
-        )
-        data = [LABELLED, PHOTOS]
-        limits = [
+        ),
+        training_data=[LABELLED, PHOTOS],
+        licence="Apache-2.0 (weights); the training images keep their own terms",
+        limits=[
             "one person per crop, the one in its centre",
             "labels are crowd-sourced or by other networks: hips and neck follow their conventions",
             "weak on rare poses, on heavy occlusion and in crowds",
             RESEARCH,
-        ]
-    else:
-        size = args.input_px or 320
-        config = {**state["config"], "blocks": tuple(state["config"]["blocks"])}
-        network = PersonNetwork(PersonConfig(**config))
-        example = torch.zeros(1, size * 3 // 4 // 32 * 32, size, 3, dtype=torch.uint8)
-        axes = {0: "n", 1: "h", 2: "w"}
-        output = DetectorOutput(
+        ],
+        measured={},
+    )
+
+
+def person_card(network: PersonNetwork, name: str, version: str, size: int) -> ModelCard:
+    """The card of a person network for photos of ``size`` pixels; its cost is a 4:3 photo's."""
+    return ModelCard(
+        name=name,
+        version=version,
+        file=f"{name}.onnx",
+        sha256="",
+        description="Person detector: residual pyramid, centre map and box sides at stride 8",
+        parameters=sum(p.numel() for p in network.parameters()),
+        multiply_adds=multiply_adds(network, torch.zeros(1, 3, -(-size * 3 // 4 // 32) * 32, size)),
+        output=DetectorOutput(
             kind="people",
             long_side_px=size,
             stride_px=PersonNetwork.STRIDE,
             unit_px=UNIT_PX,
             threshold=DETECTOR_THRESHOLD,
-        )
-        description = "Person detector: residual pyramid, centre map and box sides at stride 8"
-        data = [LABELLED, PHOTOS, SCENES]
-        limits = [
+        ),
+        training_data=[LABELLED, PHOTOS, SCENES],
+        licence="Apache-2.0 (weights); the training images keep their own terms",
+        limits=[
             "people smaller than a tenth of the photo's longer side are often missed",
             "boxes are of the joints, not of hair, clothes or things held",
             RESEARCH,
-        ]
-    network.load_state_dict(state["ema"])
-    network.eval()
-    count = multiply_adds(network, example.permute(0, 3, 1, 2).float())
-    sha256 = write_onnx(network, example, path, axes)
-    card = ModelCard(
-        name=name,
-        version=args.version,
-        file=path.name,
-        sha256=sha256,
-        description=description,
-        parameters=sum(p.numel() for p in network.parameters()),
-        multiply_adds=count,
-        output=output,
-        training_data=data,
-        licence="Apache-2.0 (weights); the training images keep their own terms",
-        limits=limits,
-        measured={"training_steps": state["step"]},
+        ],
+        measured={},
     )
-    (args.out / f"{name}.json").write_text(card.model_dump_json(indent=2) + "\n")
+
+
+def publish(model: onnx.ModelProto, card: ModelCard, directory: Path) -> ModelCard:
+    """Write the ONNX file and its card; returns the card with the file's sha256."""
+    data = model.SerializeToString(deterministic=True)
+    card = card.model_copy(update={"sha256": hashlib.sha256(data).hexdigest()})
+    directory.mkdir(parents=True, exist_ok=True)
+    (directory / card.file).write_bytes(data)
+    write_card(directory / f"{card.name}.json", card)
+    return card
+
+
+def export(
+    checkpoint: Path,
+    directory: Path,
+    kind: Kind,
+    *,
+    version: str,
+    name: str | None = None,
+    size_px: int | None = None,
+) -> ModelCard:
+    """Write the averaged weights of a training run's checkpoint as ONNX and card.
+
+    ``size_px`` is the crop's side (default: that of the run's last step) or the photo's longer
+    side (default: 320).
+    """
+    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    config = {**state["config"], "blocks": tuple(state["config"]["blocks"])}
+    if kind == "cpm":
+        cpm = ConvolutionalPoseMachine(CpmConfig(**config))
+        cpm.load_state_dict(state["ema"])
+        size = size_px or int(state["size_px"])
+        card, model = pose_card(cpm, name or kind, version, size), pose_model(cpm, size)
+    else:
+        person = PersonNetwork(PersonConfig(**config))
+        person.load_state_dict(state["ema"])
+        size = size_px or PHOTO_PX
+        card, model = person_card(person, name or kind, version, size), person_model(person)
+    card = card.model_copy(update={"measured": {"training_steps": state["step"]}})
+    return publish(model, card, directory)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("network", choices=get_args(Kind))
+    parser.add_argument("--checkpoint", type=Path, required=True)
+    parser.add_argument("--out", type=Path, default=WEIGHTS_DIR)
+    parser.add_argument("--name", help="file name without its suffix; the network's by default")
+    parser.add_argument("--version", required=True)
+    parser.add_argument("--input-px", type=int, help="crop side, or the photo's longer side")
+    args = parser.parse_args()
+    export(
+        args.checkpoint,
+        args.out,
+        args.network,
+        version=args.version,
+        name=args.name,
+        size_px=args.input_px,
+    )
 
 
 if __name__ == "__main__":

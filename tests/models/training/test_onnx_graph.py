@@ -1,0 +1,80 @@
+"""The exported graphs compute what the modules do; needs the train extra."""
+
+from pathlib import Path
+
+import numpy as np
+import onnxruntime as ort
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("onnx")
+
+from models.training.export import person_card, pose_card, publish, read_weights  # noqa: E402
+from models.training.network import (  # noqa: E402
+    ConvolutionalPoseMachine,
+    CpmConfig,
+    PersonConfig,
+    PersonNetwork,
+)
+from models.training.onnx_graph import person_model, pose_model  # noqa: E402
+
+
+def shaken(network: "torch.nn.Module") -> "torch.nn.Module":
+    """Every parameter and statistic away from where it starts, so that none can be forgotten.
+
+    Values are those that half precision has: the files store them so.
+    """
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for name, value in network.state_dict().items():
+            if value.dtype.is_floating_point:
+                noise = torch.rand(value.shape, generator=generator)
+                spread = 0.1 if value.dim() == 4 else 0.5
+                shift = 0.5 if name.endswith(("var", "weight")) and value.dim() == 1 else -0.5
+                value.copy_((spread * 2 * (noise + shift)).half().float())
+    return network.eval()
+
+
+CPM = CpmConfig(width=16, blocks=(1, 2, 1, 1), stage_width=16, n_stages=2)
+
+
+def outputs(path: Path, network: "torch.nn.Module", images: np.ndarray) -> tuple[np.ndarray, ...]:
+    session = ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    with torch.no_grad():
+        out = network(torch.from_numpy(images).permute(0, 3, 1, 2).float() / 127.5 - 1)
+    expected = (out[-1] if isinstance(out, list) else out).numpy()
+    return session.run(None, {"image": images})[0], expected
+
+
+def test_pose_graph_equals_its_module(tmp_path: Path) -> None:
+    network = shaken(ConvolutionalPoseMachine(CPM))
+    card = publish(pose_model(network, 64), pose_card(network, "tiny", "1", 64), tmp_path)
+    images = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3)).astype(np.uint8)
+    found, expected = outputs(tmp_path / card.file, network, images)
+    assert found.shape == (3, 15, 16, 16)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("shape", [(1, 64, 96, 3), (2, 96, 32, 3)])
+def test_person_graph_equals_its_module(tmp_path: Path, shape: tuple[int, ...]) -> None:
+    network = shaken(PersonNetwork(PersonConfig(width=16, blocks=(1, 1, 2))))
+    card = publish(person_model(network), person_card(network, "tiny", "1", 320), tmp_path)
+    images = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    found, expected = outputs(tmp_path / card.file, network, images)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
+
+
+def test_training_goes_on_from_an_exported_file(tmp_path: Path) -> None:
+    network = shaken(ConvolutionalPoseMachine(CPM))
+    card = publish(pose_model(network, 64), pose_card(network, "tiny", "1", 64), tmp_path)
+    again = ConvolutionalPoseMachine(CPM)
+    missing, unknown = again.load_state_dict(read_weights(tmp_path / card.file), strict=False)
+    assert all(name.endswith("num_batches_tracked") for name in missing)
+    assert unknown == []
+    for (name, a), b in zip(network.state_dict().items(), again.state_dict().values(), strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0, msg=name)
+
+
+def test_the_same_weights_give_the_same_bytes() -> None:
+    network = shaken(ConvolutionalPoseMachine(CPM))
+    assert pose_model(network, 64) == pose_model(network, 64)
