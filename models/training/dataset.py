@@ -1,8 +1,9 @@
 """Labelled person crops in memory: human labels and filtered teacher labels alike.
 
 A dataset folder or tar holds JPEG crops and an ``annotations.json``; two dialects are read:
-human labels (``joints_px`` + ``labelled``) and teacher labels (``mp33_px`` of a 33-landmark teacher
-plus ``cpm14_px``, see ``from_teachers``). Every joint carries a weight, 0 when nothing is known.
+human labels (``joints_px`` + ``labelled``; rendered people too, whose records add ``visible`` per
+joint and ``wild`` per image) and teacher labels (``mp33_px`` of a 33-landmark teacher plus
+``cpm14_px``). Every joint carries a weight, 0 when nothing is known.
 """
 
 from __future__ import annotations
@@ -96,8 +97,8 @@ def _from_labels(record: dict[str, Any], image: Image, group: int) -> LabelledCr
         image=image,
         joints_px=np.asarray(record["joints_px"], np.float32),
         weight=labelled,
-        visible=labelled,
-        wild=True,
+        visible=np.asarray(record.get("visible", labelled), np.float32) * labelled,
+        wild=bool(record.get("wild", True)),
     )
 
 

@@ -22,6 +22,7 @@ from models.training.objective import total_loss
 
 DEV_LABELLED = 200
 """Labelled crops of each training file kept aside to choose by; lspet_val is only reported."""
+DEV_RENDERED = 100
 
 
 def to_batch(samples: list[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -74,7 +75,11 @@ def measure(
 def read_crops(
     folder: Path, train: str, test: str
 ) -> tuple[list[LabelledCrop], dict[str, list[LabelledCrop]]]:
-    """Training crops, and the held-out ones by name (comma-separated names of tars in folder)."""
+    """Training crops, and the held-out ones by name.
+
+    Comma-separated names of tars in ``folder``, or paths, without ".tar"; files called rendered*
+    are trained on whole but for a few.
+    """
     crops: list[LabelledCrop] = []
     kept: dict[str, list[LabelledCrop]] = {"photos_dev": [], "labelled_dev": []}
     for name in train.split(","):
@@ -82,6 +87,9 @@ def read_crops(
         if name.startswith("lspet"):
             kept["labelled_dev"] += loaded[-DEV_LABELLED:]
             crops += loaded[:-DEV_LABELLED]
+        elif Path(name).name.startswith("rendered"):
+            kept.setdefault("rendered_dev", []).extend(loaded[-DEV_RENDERED:])
+            crops += loaded[:-DEV_RENDERED]
         else:
             kept["photos_dev"] += [c for c in loaded if held_out(c)]
             crops += [c for c in loaded if not held_out(c)]
