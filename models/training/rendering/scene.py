@@ -187,7 +187,7 @@ def _light(rng: np.random.Generator, rotation: Floats, around: Floats) -> _Light
     above[1] = abs(above[1]) + 0.4
     towards = rotation @ (above / np.linalg.norm(above))
     level = float(np.clip(around.mean() * rng.uniform(1.0, 1.8) + 0.4, 0.55, 1.25))
-    tint = np.clip(around.mean((0, 1)) / max(float(around.mean()), 0.05), 0.7, 1.3) ** 0.5
+    tint = np.clip(around.mean((0, 1)) / max(float(around.mean()), 0.05), 0.7, 1.3) ** 0.35
     share = rng.uniform(0.15, 0.75)
     sky = level * tint * (1.05 - 0.6 * share)
     return _Light(
