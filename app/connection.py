@@ -53,9 +53,11 @@ class Connection(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Feed the parser; a head may be split over many pieces but not over too many bytes."""
-        if not self._in_body and _UPGRADE.search(data):
-            head, end, rest = data.partition(b"\r\n\r\n")
-            data = _UPGRADE.sub(b"X-Grade", head) + end + rest
+        if not self._in_body:
+            end = data.find(b"\r\n\r\n")
+            end = len(data) if end < 0 else end
+            if _UPGRADE.search(data, 0, end):
+                data = _UPGRADE.sub(b"X-Grade", data[:end]) + data[end:]
         super().data_received(data)
         if "head" in self._timers:
             self._head_bytes += len(data)

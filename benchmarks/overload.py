@@ -1,0 +1,70 @@
+"""More work than there is room for: what is accepted must be answered as fast as ever.
+
+    python -m benchmarks.overload [--times 4] [--seconds 20]
+
+First the capacity: images a second, closed loop, at the concurrency that gives most. Then
+``--times`` as many a second are sent whatever happens to them (open loop). Printed for both:
+goodput, latency of the accepted and of the refused, every status, resident memory, and the CPU
+time of server and generator, which share the machine. Exit code 1 when anything but 200 and 503
+came back, a connection broke, or goodput fell under 90% of capacity.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.load import Load, closed_loop, encode_request, open_loop
+from benchmarks.service import DEFAULT_PHOTO, Service, given_or_started
+
+WANTED_GOODPUT = 0.9
+
+
+def main() -> None:
+    """Parse the command line, measure, print, judge."""
+    parser = argparse.ArgumentParser(description="Behaviour under overload.")
+    parser.add_argument("--url", help="measure this server instead of starting one")
+    parser.add_argument("--pid", type=int, help="its process (with --url)")
+    parser.add_argument("--photo", type=Path, default=DEFAULT_PHOTO)
+    parser.add_argument("--times", type=float, default=4.0, help="offered load over capacity")
+    parser.add_argument("--seconds", type=float, default=20.0, help="of each run, at most 300")
+    arguments = parser.parse_args()
+    seconds = min(max(arguments.seconds, 1.0), 300.0)
+    with given_or_started(arguments.url, arguments.pid) as service:
+        request = encode_request(service, arguments.photo.read_bytes())
+        closed_loop(service, request, 2, seconds=2.0)  # warm up
+        runs = [closed_loop(service, request, concurrency, seconds) for concurrency in (2, 4, 8)]
+        capacity = max(runs, key=lambda load: load.goodput)
+        report("capacity (closed loop)", capacity, service)
+        rate = arguments.times * capacity.goodput
+        overload = open_loop(service, request, rate, seconds)
+        report(f"offered {rate:.0f}/s (open loop)", overload, service)
+    share = overload.goodput / capacity.goodput
+    print(f"\ngoodput {100 * share:.0f}% of capacity")
+    strange = set(overload.statuses) - {200, 503}
+    if strange or overload.broken or share < WANTED_GOODPUT:
+        sys.exit(f"failed: statuses {strange or 'fine'}, {overload.broken} broken, {share:.2f}")
+
+
+def report(title: str, load: Load, service: Service) -> None:
+    """Print what a run measured."""
+    cores = (load.server_cpu_s / load.seconds, load.client_cpu_s / load.seconds)
+    print(f"\n{title}: {load.goodput:.1f} images/s, statuses {dict(load.statuses)}")
+    print(f"  cores used: server {cores[0]:.2f}, generator {cores[1]:.2f}")
+    print(f"  resident memory {service.resident_mb():.0f} MB, open files {service.open_files()}")
+    rows = {
+        "accepted": load.latencies_ms,
+        "refused": load.refusals_ms,
+        "refused, in the server": load.refusals_app_ms,
+    }
+    for name, spent_ms in rows.items():
+        if spent_ms:
+            p50, p99 = np.percentile(spent_ms, [50, 99])
+            print(f"  {name:>24}: p50 {p50:.1f} ms, p99 {p99:.1f} ms")
+
+
+if __name__ == "__main__":
+    main()
