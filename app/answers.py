@@ -14,8 +14,10 @@ from app.engine import Engine
 from app.lifting.types import Hypothesis, Intrinsics, LiftedPerson, Method
 from app.pipeline import LiftResult, PhotoResult, SeenPerson
 from library_store.conversion import CONVERSIONS
-from library_store.library import Library, Source
+from library_store.library import Library
+from library_store.manifest import Licence
 from library_store.skeleton import LSP14
+from library_store.sources import Source
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -138,6 +140,11 @@ def lift_answer(
     )
 
 
+def licence_of(licence: Licence) -> schemas.Licence:
+    """One of the licences of a library's sources."""
+    return schemas.Licence(source=licence.source, licence=licence.licence, credit=licence.credit)
+
+
 def exemplar_answer(library: Library, exemplar_id: str) -> schemas.ExemplarAnswer:
     """One exemplar; ``KeyError`` when the library has none of that id."""
     entry = library.find(exemplar_id)
@@ -148,6 +155,7 @@ def exemplar_answer(library: Library, exemplar_id: str) -> schemas.ExemplarAnswe
         library=library_of(library),
         skeleton=SKELETON,
         source=_source(library.source(entry)),
+        licences=tuple(licence_of(licence) for licence in library.licences(entry)),
         joints_mm=_rows(library.poses_mm(entries)[0]),
         rotation=_matrix(rotation[0]),
         translation_mm=_vector(translation_mm[0]),
@@ -232,7 +240,23 @@ def _candidate(hypothesis: Hypothesis, wording: Wording) -> schemas.Candidate:
 
 def _source(source: Source) -> schemas.Source:
     if source.kind == "mocap":
-        return schemas.MocapSource(clip=str(source.clip), frame=int(source.frame or 0))
+        return schemas.MocapSource(
+            clip=str(source.clip),
+            frame=int(source.frame or 0),
+            mirrored=source.mirrored,
+            subject=source.subject,
+            action=source.action,
+        )
+    if source.kind == "composed":
+        return schemas.ComposedSource(
+            index=int(source.index or 0),
+            parts=tuple(
+                schemas.SourcePart(
+                    part=part.name, clip=part.clip, frame=part.frame, mirrored=part.mirrored
+                )
+                for part in source.parts
+            ),
+        )
     return schemas.SampledSource(prior=str(source.prior), index=int(source.index or 0))
 
 

@@ -109,11 +109,34 @@ class Joint3D(Answer):
 
 
 class MocapSource(Answer):
-    """An exemplar that was captured: the clip and its frame."""
+    """An exemplar that was captured: the clip and its frame, maybe mirrored.
+
+    ``subject`` and ``action`` are empty where the clip does not say them.
+    """
 
     kind: Literal["mocap"] = "mocap"
     clip: str
     frame: int
+    mirrored: bool = False
+    subject: str = ""
+    action: str = ""
+
+
+class SourcePart(Answer):
+    """A part of a composed exemplar and the captured frame it was taken from."""
+
+    part: Literal["legs", "upper_body"]
+    clip: str
+    frame: int
+    mirrored: bool
+
+
+class ComposedSource(Answer):
+    """An exemplar put together from parts of captured ones: the composition and its number."""
+
+    kind: Literal["composed"] = "composed"
+    index: int
+    parts: tuple[SourcePart, ...]
 
 
 class SampledSource(Answer):
@@ -124,7 +147,7 @@ class SampledSource(Answer):
     index: int
 
 
-Source = Annotated[MocapSource | SampledSource, Field(discriminator="kind")]
+Source = Annotated[MocapSource | ComposedSource | SampledSource, Field(discriminator="kind")]
 
 
 class Exemplar(Answer):
@@ -282,6 +305,14 @@ class LiftRequest(Given):
         return self
 
 
+class Licence(Answer):
+    """Where some of the library's poses come from and what may be done with them."""
+
+    source: str
+    licence: str
+    credit: str
+
+
 class ExemplarAnswer(Answer):
     """One exemplar of the library: its pose in its own frame (root-centred, Y up, mm), its
     provenance, and the library camera it was projected with: X_camera = rotation @ X + translation.
@@ -291,17 +322,10 @@ class ExemplarAnswer(Answer):
     library: LibraryRef
     skeleton: Skeleton
     source: Source
+    licences: tuple[Licence, ...]
     joints_mm: Pose
     rotation: Matrix3
     translation_mm: Vector3
-
-
-class Licence(Answer):
-    """Where some of the library's poses come from and what may be done with them."""
-
-    source: str
-    licence: str
-    credit: str
 
 
 class Limits(Answer):

@@ -1,58 +1,54 @@
-"""Building libraries: sampled poses, virtual cameras, descriptors, index, and the atomic publish.
+"""Building libraries: from a pose prior, from captured poses, or from both.
 
 Every file is written into a hidden directory beside the target and flushed to the disk, the
 manifest last; then the directory takes the target's place in one step. A build killed at any
-moment leaves the library that was there. A lock beside the target keeps builds of the same library
-from running at once; whoever holds it sweeps what killed builds left behind.
+moment leaves the library that was there, and its finished steps to the next build of the same
+inputs. A lock beside the target keeps builds of the same library from running at once; whoever
+holds it sweeps what killed builds of other inputs left behind.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from library_store.cameras import COLUMNS, DISTANCE_RANGE_MM, project, sample_cameras
-from library_store.descriptor import DIMENSIONS, describe
+from library_store.assemble import write_descriptors, write_index, write_manifest, write_poses
+from library_store.cameras import COLUMNS, DISTANCE_RANGE_MM
 from library_store.errors import LibraryError
-from library_store.index import HnswIndex, HnswSettings
-from library_store.library import INDEX_FILE, NAME_PATTERN, SourceGroup
-from library_store.manifest import (
-    CONTENT_FILES,
-    FORMAT,
-    MANIFEST,
-    Licence,
-    Manifest,
-    check_files,
-    content_digest,
-    file_sum,
-    read_manifest,
-)
+from library_store.index import HnswSettings
+from library_store.manifest import FORMAT, Licence, Manifest, check_files, file_sum, read_manifest
+from library_store.mocap import MocapSettings, gather
 from library_store.prior import DEFAULT_PRIOR, PosePrior
 from library_store.publish import locked, replacing
-from library_store.skeleton import LSP14
+from library_store.sections import Composed, Sampled, Section, captured
+from library_store.sources import NAME_PATTERN, SourceClip
+from library_store.steps import Facts, Steps
 
 Progress = Callable[[str, float], None]
 """Hears the stage's name and the fraction of it that is done."""
 
-RECIPE = 1
+RECIPE = 2
 """Raised whenever the code would build another library from the same parameters."""
 
-_CHUNK = 1_000
-_POSE_GRID_MM = 0.01
+BYTES_PER_EXEMPLAR = 600
+"""About what an exemplar takes on the disk, its share of the index included."""
 
 
 @dataclass(frozen=True)
 class BuildSettings:
-    """What a sampled library is built with.
+    """What a library is built with.
 
     ``n_poses`` poses are drawn and each seen by ``cameras_per_pose`` cameras of its own. Sample i
     depends on the seed, the prior and i only: a smaller library is the beginning of a larger one.
+    With mocap their product is the number of exemplars in all; captured poses get as many cameras
+    as it takes. ``version`` is free text; by default the prior's, or 1.
     """
 
     name: str = "default"
@@ -60,12 +56,34 @@ class BuildSettings:
     cameras_per_pose: int = 1
     seed: int = 0
     index: HnswSettings = field(default_factory=HnswSettings)
+    version: str = ""
 
     def __post_init__(self) -> None:
         if not NAME_PATTERN.fullmatch(self.name):
             raise ValueError(f"library name {self.name!r} must match {NAME_PATTERN.pattern}")
         if self.n_poses < 1 or self.cameras_per_pose < 1:
             raise ValueError("a library needs at least one pose and one camera")
+
+    @property
+    def n_exemplars(self) -> int:
+        """How many exemplars are wanted."""
+        return self.n_poses * self.cameras_per_pose
+
+
+@dataclass(frozen=True)
+class Mocap:
+    """Captured poses to build from: npz files of clips (`posematch library import` writes them).
+
+    ``prior_share``: the share of exemplars that are sampled, when a prior joins the mocap.
+    """
+
+    files: tuple[Path, ...]
+    settings: MocapSettings = field(default_factory=MocapSettings)
+    prior_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not self.files or not 0 <= self.prior_share <= 1:
+            raise ValueError("there must be files, and a share between 0 and 1")
 
 
 def ensure_default_library(
@@ -89,41 +107,50 @@ def ensure_default_library(
     return directory
 
 
-def build_key(prior: PosePrior, settings: BuildSettings) -> str:
-    """Digest of everything that decides a library's content."""
-    inputs = {
-        "prior": prior.sha256,
+def build_key(prior: PosePrior | None, settings: BuildSettings, mocap: Mocap | None = None) -> str:
+    """Digest of everything that decides a library's content. Reads the files of mocap."""
+    inputs: dict[str, Any] = {
+        "prior": prior.sha256 if prior else None,
         "settings": asdict(settings),
         "recipe": RECIPE,
         "format": FORMAT,
     }
-    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
+    if mocap:
+        inputs["mocap"] = [_digests(mocap), asdict(mocap.settings), mocap.prior_share]
+    return _digest(inputs)
 
 
 def build_library(
     directory: Path,
-    prior: PosePrior,
+    prior: PosePrior | None,
     settings: BuildSettings,
     progress: Progress | None = None,
     *,
+    mocap: Mocap | None = None,
     keep_if: Callable[[Path], bool] | None = None,
 ) -> Manifest:
-    """Build a library of sampled poses and put it at ``directory``, replacing what is there.
+    """Build a library and put it at ``directory``, replacing what is there.
 
+    ``prior`` alone: sampled poses. ``mocap`` alone: captured and recombined ones. Both: all three.
     ``keep_if`` is asked once the lock is held: when another process has meanwhile built what is
-    wanted, that is kept. Returns the manifest. Raises ``LibraryError`` when the disk refuses.
+    wanted, that is kept. Returns the manifest. Raises ``LibraryError`` when an input cannot be used
+    or the disk refuses.
     """
+    if prior is None and mocap is None:
+        raise ValueError("a library is built from a prior, from mocap or from both")
     report = progress or (lambda _stage, _fraction: None)
     try:
         with locked(directory, waiting=lambda: report("waiting for another build", 0.0)):
             if keep_if is not None and keep_if(directory):
                 return read_manifest(directory)
-            with replacing(directory) as workshop:
-                return _fill(workshop, prior, settings, report)
+            key = build_key(prior, settings, mocap)
+            with replacing(directory, key[:12]) as workshop:
+                return _fill(workshop, prior, settings, mocap, report)
     except OSError as error:
+        needed_mb = 100 + settings.n_exemplars * BYTES_PER_EXEMPLAR // 1_000_000
         raise LibraryError(
             f"the library {directory} cannot be built: {error}; "
-            "check that its parent directory is writable and has 300 MB free"
+            f"check that its parent directory is writable and has {needed_mb} MB free"
         ) from error
 
 
@@ -149,83 +176,104 @@ def _is_whole(directory: Path) -> bool:
     return True
 
 
-def _fill(workshop: Path, prior: PosePrior, settings: BuildSettings, report: Progress) -> Manifest:
-    """Write all files of the library into ``workshop``; the manifest last."""
-    poses, cameras = _sample(prior, settings, report)
-    n_exemplars = len(cameras)
-    pose_of = np.repeat(np.arange(settings.n_poses, dtype=np.int32), settings.cameras_per_pose)
-    projections = np.column_stack([pose_of, np.arange(n_exemplars, dtype=np.int32)])
-    descriptors = np.empty((n_exemplars, DIMENSIONS), dtype=np.float32)
-    for rows in _chunks(n_exemplars):
-        descriptors[rows] = describe(project(cameras[rows], poses[pose_of[rows]]))
-        report("descriptors", rows.stop / n_exemplars)
-    source = f"{prior.card.name}-{prior.sha256[:8]}"
-    group = SourceGroup(kind="sampled", name=source, first_pose=0, n_poses=settings.n_poses)
-
-    tables: dict[str, NDArray[np.generic]] = {
-        "poses.npy": poses,
-        "frames.npy": np.arange(settings.n_poses, dtype=np.int32),
-        "cameras.npy": cameras,
-        "projections.npy": projections,
-        "descriptors.npy": descriptors,
+def _fill(
+    workshop: Path,
+    prior: PosePrior | None,
+    settings: BuildSettings,
+    mocap: Mocap | None,
+    report: Progress,
+) -> Manifest:
+    """Write all files of the library into ``workshop``, step by step; the manifest last."""
+    steps = Steps(workshop)
+    sections: list[Section] = []
+    clips: tuple[SourceClip, ...] = ()
+    licences: list[Licence] = []
+    build: dict[str, Any] = {
+        "recipe": RECIPE,
+        "seed": settings.seed,
+        "cameras_per_pose": settings.cameras_per_pose,
+        "camera_columns": list(COLUMNS),
+        "camera_distance_mm": list(DISTANCE_RANGE_MM),
     }
-    for name, table in tables.items():
-        np.save(workshop / name, table, allow_pickle=False)
-    (workshop / "sources.json").write_text(json.dumps([asdict(group)]) + "\n", encoding="utf-8")
-    HnswIndex.build(descriptors, settings.index, lambda done: report("index", done)).save(
-        workshop / INDEX_FILE
-    )
-
-    report("checksums", 0.0)
-    files = {name: file_sum(workshop / name) for name in (*CONTENT_FILES, INDEX_FILE)}
-    manifest = Manifest(
+    n_sampled = settings.n_exemplars
+    if mocap:
+        share = mocap.prior_share if prior else 0.0
+        n_sampled = round(share * settings.n_exemplars)
+        pool, facts = gather(steps, workshop, mocap.files, mocap.settings, report)
+        clips, licences = pool.clips, list(pool.licences)
+        n_composed = round(mocap.settings.recombined * (settings.n_exemplars - n_sampled))
+        n_captured = settings.n_exemplars - n_sampled - n_composed
+        sections += captured(pool, mocap.settings, n_captured, settings.seed)
+        if n_composed:
+            sections.append(
+                Composed(
+                    pool=pool,
+                    settings=mocap.settings,
+                    name=f"mix-{_composition(mocap, settings.seed)[:8]}",
+                    cameras=_spread(n_composed, settings.cameras_per_pose),
+                    seed=settings.seed,
+                )
+            )
+        build["sources"] = _digests(mocap)
+        build["steps"] = {**facts, **_describe(mocap.settings, n_captured, n_composed)}
+    if prior and n_sampled:
+        numbers = tuple(range(len(licences), len(licences) + len(prior.card.licences)))
+        licences += [Licence(**licence) for licence in prior.card.licences]
+        cameras = _spread(n_sampled, settings.cameras_per_pose)
+        sections.append(Sampled(prior, cameras, settings.seed, numbers))
+        build["prior"] = {
+            "name": prior.card.name,
+            "version": prior.card.version,
+            "sha256": prior.sha256,
+            "exemplars": n_sampled,
+        }
+    posed = write_poses(steps, workshop, sections, clips, report)
+    seen = write_descriptors(steps, workshop, settings.seed, report)
+    return write_manifest(
+        steps,
+        workshop,
+        report,
         name=settings.name,
-        version=prior.card.version,
-        skeleton=LSP14.name,
-        n_poses=settings.n_poses,
-        n_cameras=n_exemplars,
-        n_exemplars=n_exemplars,
-        licences=tuple(Licence(**licence) for licence in prior.card.licences),
-        build={
-            "recipe": RECIPE,
-            "seed": settings.seed,
-            "cameras_per_pose": settings.cameras_per_pose,
-            "camera_columns": list(COLUMNS),
-            "camera_distance_mm": list(DISTANCE_RANGE_MM),
-            "prior": {
-                "name": prior.card.name,
-                "version": prior.card.version,
-                "sha256": prior.sha256,
-            },
-        },
-        index=settings.index.describe(),
-        files=files,
-        sha256=content_digest(files),
+        version=settings.version or (prior.card.version if prior and not mocap else "1"),
+        licences=licences,
+        build=build,
+        index=write_index(steps, workshop, settings.index, report),
+        counts={**posed, **seen},
     )
-    (workshop / MANIFEST).write_text(manifest.to_json(), encoding="utf-8")
-    report("checksums", 1.0)
-    return manifest
 
 
-def _sample(
-    prior: PosePrior, settings: BuildSettings, report: Progress
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Poses (P, 14, 3) mm and cameras (P * cameras_per_pose, 4), chunk by seeded chunk."""
-    per_pose = settings.cameras_per_pose
-    poses = np.empty((settings.n_poses, LSP14.n_joints, 3), dtype=np.float32)
-    cameras = np.empty((settings.n_poses * per_pose, len(COLUMNS)), dtype=np.float32)
-    for number, rows in enumerate(_chunks(settings.n_poses)):
-        # Always a whole chunk, so that sample i does not depend on how many are wanted.
-        n = rows.stop - rows.start
-        drawn = prior.sample(_CHUNK, np.random.default_rng([settings.seed, number, 0]))
-        # A grid much finer than the poses are true hides the last bits of the maths library.
-        poses[rows] = np.round(drawn[:n] / _POSE_GRID_MM) * _POSE_GRID_MM
-        seen = sample_cameras(_CHUNK * per_pose, np.random.default_rng([settings.seed, number, 1]))
-        cameras[rows.start * per_pose : rows.stop * per_pose] = seen[: n * per_pose]
-        report("poses", rows.stop / settings.n_poses)
-    return poses, cameras
+def _describe(settings: MocapSettings, n_captured: int, n_composed: int) -> dict[str, Facts]:
+    """What the manifest says about the steps after thinning."""
+    return {
+        "captured": {"exemplars": n_captured, "mirrored_too": settings.mirror},
+        "recombine": {
+            "exemplars": n_composed,
+            "limit_quantile": settings.limit_quantile,
+            "stature_sd": settings.stature_sd,
+            "bone_sd": settings.bone_sd,
+        },
+    }
 
 
-def _chunks(n: int) -> Iterator[slice]:
-    for start in range(0, n, _CHUNK):
-        yield slice(start, min(start + _CHUNK, n))
+def _spread(n_exemplars: int, cameras_per_pose: int) -> NDArray[np.int64]:
+    """How many cameras see each pose, the last one maybe fewer than the others."""
+    whole, rest = divmod(n_exemplars, cameras_per_pose)
+    return np.array([cameras_per_pose] * whole + [rest] * (rest > 0), dtype=np.int64)
+
+
+def _composition(mocap: Mocap, seed: int) -> str:
+    """Digest of what decides recombined poses; how many are wanted does not."""
+    settings = asdict(mocap.settings) | {"recombined": None, "licence": None, "credit": None}
+    return _digest({"files": _digests(mocap), "settings": settings, "seed": seed, "recipe": RECIPE})
+
+
+def _digests(mocap: Mocap) -> list[dict[str, str]]:
+    """The files by name and SHA-256, in order."""
+    try:
+        return [{"file": file.name, "sha256": file_sum(file).sha256} for file in mocap.files]
+    except OSError as error:
+        raise LibraryError(f"{error.filename} cannot be read: {error.strerror}") from error
+
+
+def _digest(inputs: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()

@@ -2,18 +2,15 @@
 
 An *exemplar* (an entry) is one pose seen by one virtual camera. Entries are numbers from 0; their
 ids, ``<library>:<source>:<clip>:<frame>:<camera>``, are URL-safe and stable across rebuilds from
-the same inputs. ``<source>`` is ``mocap`` or ``sampled``; for a sampled pose ``<clip>`` is the
-prior and ``<frame>`` the number of the sample.
+the same inputs. ``<source>`` is ``mocap``, ``composed`` or ``sampled``; for a composed pose
+``<clip>`` is the composition and ``<frame>`` its number in it, for a sampled one the prior and the
+number of the sample (:mod:`library_store.sources`).
 """
 
 from __future__ import annotations
 
-import json
-import re
-from bisect import bisect_right
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,40 +19,22 @@ from library_store import cameras as camera_geometry
 from library_store.descriptor import DIMENSIONS, describe
 from library_store.errors import LibraryError
 from library_store.index import ExactIndex, HnswIndex, Index
-from library_store.manifest import MEND, Manifest, check_files, read_manifest
+from library_store.manifest import MEND, Licence, Manifest, check_files, read_manifest
 from library_store.masked import MaskedSearch
+from library_store.sources import (
+    FRAMES_FILE,
+    PARTS_FILE,
+    SOURCES_FILE,
+    Source,
+    Sources,
+    read_sources,
+)
+from library_store.tables import open_table
 
 Float = NDArray[np.float64]
 Entries = NDArray[np.int64]
 
 INDEX_FILE = "index.hnsw"
-NAME_PATTERN = re.compile(r"[A-Za-z0-9._~-]+")
-"""What names of libraries, clips and priors are made of, so that exemplar ids are URL-safe."""
-
-
-@dataclass(frozen=True)
-class Source:
-    """Where a pose comes from.
-
-    ``kind`` ``mocap``: ``clip`` and ``frame``; ``sampled``: ``prior`` and ``index``, the number of
-    the sample. The other fields are ``None``.
-    """
-
-    kind: Literal["mocap", "sampled"]
-    clip: str | None
-    frame: int | None
-    prior: str | None
-    index: int | None
-
-
-@dataclass(frozen=True)
-class SourceGroup:
-    """A run of poses from one clip or one prior, in ascending order of frame."""
-
-    kind: Literal["mocap", "sampled"]
-    name: str
-    first_pose: int
-    n_poses: int
 
 
 @dataclass(frozen=True)
@@ -79,24 +58,17 @@ class Library:
         self.directory = directory
         self.manifest = manifest
 
-        def table(name: str) -> NDArray[np.generic]:
-            # A plain view of the map: np.memmap's own indexing is slow for small reads.
-            mapped: NDArray[np.generic] = np.load(
-                directory / name, mmap_mode="r", allow_pickle=False
-            )
-            return mapped.view(np.ndarray)
-
-        self._poses = table("poses.npy")
-        self._frames = table("frames.npy")
-        self._cameras = table("cameras.npy")
-        self._projections = table("projections.npy")
-        self._descriptors: NDArray[np.float32] = table("descriptors.npy").astype(
+        self._poses = open_table(directory / "poses.npy")
+        self._cameras = open_table(directory / "cameras.npy")
+        self._projections = open_table(directory / "projections.npy")
+        self._descriptors: NDArray[np.float32] = open_table(directory / "descriptors.npy").astype(
             np.float32, copy=False
         )
-        groups = json.loads((directory / "sources.json").read_text(encoding="utf-8"))
-        self._groups = tuple(SourceGroup(**group) for group in groups)
-        self._first_poses = [group.first_pose for group in self._groups]
-        self._group_of = {(group.kind, group.name): group for group in self._groups}
+        self.sources = read_sources(
+            directory / SOURCES_FILE,
+            open_table(directory / FRAMES_FILE).astype(np.int32, copy=False),
+            open_table(directory / PARTS_FILE).astype(np.int32, copy=False),
+        )
         self._check_shapes()
         self._index: Index
         if exact_index or manifest.index["backend"] == ExactIndex.backend:
@@ -109,7 +81,7 @@ class Library:
         counts = self.manifest
         expected = {
             "poses.npy": (self._poses, (counts.n_poses, 14, 3)),
-            "frames.npy": (self._frames, (counts.n_poses,)),
+            FRAMES_FILE: (self.sources.frames, (counts.n_poses,)),
             "cameras.npy": (self._cameras, (counts.n_cameras, 4)),
             "projections.npy": (self._projections, (counts.n_exemplars, 2)),
             "descriptors.npy": (self._descriptors, (counts.n_exemplars, 28)),
@@ -177,46 +149,40 @@ class Library:
 
     def source(self, entry: int) -> Source:
         """Where the pose of ``entry`` comes from."""
-        group, frame = self._group_and_frame(int(self._projections[entry, 0]))
-        if group.kind == "mocap":
-            return Source("mocap", clip=group.name, frame=frame, prior=None, index=None)
-        return Source("sampled", clip=None, frame=None, prior=group.name, index=frame)
+        return self.sources.of(int(self._projections[entry, 0]))
+
+    def licences(self, entry: int) -> tuple[Licence, ...]:
+        """Under which licences the pose of ``entry`` may be used: all of them at once."""
+        return tuple(self.manifest.licences[number] for number in self.source(entry).licences)
 
     def exemplar_id(self, entry: int) -> str:
         """The id of ``entry``: ``<library>:<source>:<clip>:<frame>:<camera>``."""
         pose, camera = (int(number) for number in self._projections[entry])
-        group, frame = self._group_and_frame(pose)
-        return f"{self.manifest.name}:{group.kind}:{group.name}:{frame}:{camera}"
+        return f"{self.manifest.name}:{self.sources.name_of(pose)}:{camera}"
 
     def find(self, exemplar_id: str) -> int:
         """The entry of an exemplar id; ``KeyError`` when this library has none of that id."""
         try:
             library, kind, name, frame, camera = exemplar_id.split(":")
-            group = self._group_of[kind, name]  # type: ignore[index]
-            frames = self._frames[group.first_pose : group.first_pose + group.n_poses]
-            at = int(np.searchsorted(frames, int(frame)))
-            pose = group.first_pose + at
+            pose = self.sources.find(kind, name, int(frame))
             span = np.searchsorted(self._projections[:, 0], [pose, pose + 1])
             seen_by = self._projections[span[0] : span[1], 1]
             entry = int(span[0] + np.searchsorted(seen_by, int(camera)))
             # Also refuses what int() is lenient about: "+7", "07", " 7".
             if library == self.manifest.name and self.exemplar_id(entry) == exemplar_id:
                 return entry
-        except (ValueError, KeyError, IndexError):
+        except (ValueError, KeyError, IndexError, OverflowError):
             pass
         raise KeyError(exemplar_id)
 
     def close(self) -> None:
         """Let go of the memory; the library must not be used afterwards."""
         empty = np.zeros(0, dtype=np.float32)
-        self._poses = self._frames = self._cameras = self._projections = empty
+        self._poses = self._cameras = self._projections = empty
+        self.sources = Sources((), (), empty.astype(np.int32), empty.astype(np.int32))
         self._descriptors = empty
         self._index = ExactIndex(empty)
         self._masked = MaskedSearch(empty.reshape(0, DIMENSIONS))
-
-    def _group_and_frame(self, pose: int) -> tuple[SourceGroup, int]:
-        group = self._groups[bisect_right(self._first_poses, pose) - 1]
-        return group, int(self._frames[pose])
 
 
 def load(directory: Path, *, verify: bool = True, exact_index: bool = False) -> Library:

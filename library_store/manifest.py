@@ -5,7 +5,8 @@ A library is a directory of
 - ``manifest.json``   this file's subject, written last;
 - ``poses.npy``       (P, 14, 3) float32 mm, exemplar frame, grouped by source;
 - ``frames.npy``      (P,) int32, the frame or sample number within the source;
-- ``sources.json``    the sources: kind, name, first pose, number of poses;
+- ``sources.json``    the sources, :mod:`library_store.sources`;
+- ``parts.npy``       (composed poses, 2, 3) int32, what each was composed of;
 - ``cameras.npy``     (C, 4) float32, :mod:`library_store.cameras`;
 - ``projections.npy`` (E, 2) int32, pose and camera of each exemplar, ascending;
 - ``descriptors.npy`` (E, 28) float32, :mod:`library_store.descriptor`;
@@ -23,12 +24,13 @@ from typing import Any
 
 from library_store.errors import LibraryError
 
-FORMAT = 1
+FORMAT = 2
 MANIFEST = "manifest.json"
 CONTENT_FILES = (
     "poses.npy",
     "frames.npy",
     "sources.json",
+    "parts.npy",
     "cameras.npy",
     "projections.npy",
     "descriptors.npy",

@@ -1,8 +1,9 @@
 """Putting a directory in place in one step, and keeping builders of the same one apart.
 
-Beside a target ``<name>`` live, hidden, its lock ``.<name>.lock`` and the directories
-``.<name>.building-*`` that builds work in. A killed build leaves such a directory; the next
-builder, who holds the lock, sweeps it.
+Beside a target ``<name>`` live, hidden, its lock ``.<name>.lock`` and the directory
+``.<name>.building-<key>`` that a build works in, the key being a digest of what is built. A killed
+build leaves its directory; the next builder, who holds the lock, goes on with it if the key is the
+same and sweeps it if not.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from library_store.steps import flush
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
@@ -38,27 +41,31 @@ def locked(target: Path, waiting: Callable[[], None]) -> Iterator[None]:
 
 
 @contextmanager
-def replacing(target: Path) -> Iterator[Path]:
-    """An empty directory to fill, which takes the place of ``target`` when the block ends well.
+def replacing(target: Path, key: str) -> Iterator[Path]:
+    """The directory to fill, which takes the place of ``target`` when the block ends well.
 
-    To be used while :func:`locked`. If the block raises, ``target`` stays as it was and the
-    directory is removed.
+    To be used while :func:`locked`. It is empty, or what a killed build of the same ``key`` left.
+    If the block fails, ``target`` stays as it was and the directory is removed; if it is
+    interrupted (Ctrl-C), the directory stays for the next attempt.
     """
     prefix = f".{target.name}.building-"
+    workshop = target.parent / f"{prefix}{key}"
     for leftover in target.parent.glob(f"{prefix}*"):
-        shutil.rmtree(leftover, ignore_errors=True)
-    workshop = target.parent / f"{prefix}{os.getpid()}"
-    workshop.mkdir()
+        if leftover != workshop:
+            shutil.rmtree(leftover, ignore_errors=True)
+    workshop.mkdir(exist_ok=True)
     try:
         yield workshop
         for path in workshop.iterdir():
-            _flush(path)
-        _flush(workshop)
+            flush(path)
+        flush(workshop)
         put_in_place(workshop, target)
-        _flush(target.parent)
-    finally:
-        # After an exchange this is the old library; readers keep their open maps of it.
+        flush(target.parent)
+    except Exception:
         shutil.rmtree(workshop, ignore_errors=True)
+        raise
+    # After an exchange this is the old library; readers keep their open maps of it.
+    shutil.rmtree(workshop, ignore_errors=True)
 
 
 def put_in_place(workshop: Path, target: Path) -> None:
@@ -94,11 +101,3 @@ def _exchange(one: Path, other: Path) -> bool:
     if number in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
         return False
     raise OSError(number, os.strerror(number), str(other))
-
-
-def _flush(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

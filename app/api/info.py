@@ -7,7 +7,7 @@ from typing import get_args
 from fastapi import APIRouter, Depends
 
 from app import schemas
-from app.answers import SKELETON, library_of, model_of
+from app.answers import SKELETON, library_of, licence_of, model_of
 from app.api.deps import EngineDep, ServiceDep, authorise
 from app.api.problems import describe
 from app.imaging import accepted_types
@@ -27,10 +27,7 @@ async def get_info(service: ServiceDep, engine: EngineDep) -> schemas.InfoAnswer
         version=VERSION,
         model=model_of(engine),
         library=library_of(engine.library),
-        licences=tuple(
-            schemas.Licence(source=it.source, licence=it.licence, credit=it.credit)
-            for it in engine.library.manifest.licences
-        ),
+        licences=tuple(licence_of(licence) for licence in engine.library.manifest.licences),
         skeleton=SKELETON,
         methods=get_args(schemas.Method),
         limits=schemas.Limits(

@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 
 from app.lifting.geometry import Floats
-from library_store.library import Source
 from library_store.skeleton import LSP14
+from library_store.sources import Source
 
 Method = Literal["fusion", "paper"]
 FocalSource = Literal["request", "exif", "assumed"]
