@@ -101,10 +101,18 @@ def ensure_default_library(
     """
     prior = PosePrior.load(DEFAULT_PRIOR)
     settings = settings or BuildSettings()
-    directory = cache_dir / f"{settings.name}-{build_key(prior, settings)[:12]}"
+    directory = default_library_dir(cache_dir, prior, settings)
     if not _is_whole(directory):
         build_library(directory, prior, settings, progress, keep_if=_is_whole)
     return directory
+
+
+def default_library_dir(
+    cache_dir: Path, prior: PosePrior | None = None, settings: BuildSettings | None = None
+) -> Path:
+    """Where ``ensure_default_library`` keeps the default library, whether it is there or not."""
+    prior, settings = prior or PosePrior.load(DEFAULT_PRIOR), settings or BuildSettings()
+    return cache_dir / f"{settings.name}-{build_key(prior, settings)[:12]}"
 
 
 def build_key(prior: PosePrior | None, settings: BuildSettings, mocap: Mocap | None = None) -> str:
