@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -126,14 +126,17 @@ class LiftResult:
 
 @dataclass
 class StageClock:
-    """Measures the stages of one request, milliseconds of wall time."""
+    """Measures the stages of one request in milliseconds, by default of wall time."""
 
+    now_s: Callable[[], float] = time.perf_counter
     timings_ms: dict[str, float] = field(default_factory=dict)
-    _since_s: float = field(default_factory=time.perf_counter)
+
+    def __post_init__(self) -> None:
+        self._since_s = self.now_s()
 
     def lap(self, stage: str) -> None:
         """End ``stage``, which began with the lap before; a stage's laps add up."""
-        now_s = time.perf_counter()
+        now_s = self.now_s()
         spent_ms = 1e3 * (now_s - self._since_s)
         self.timings_ms[stage] = self.timings_ms.get(stage, 0.0) + spent_ms
         self._since_s = now_s
@@ -184,13 +187,15 @@ class Pipeline:
         self._max_pixels = max_pixels
         self._decode_side_px = decode_side_px
 
-    def estimate(self, data: bytes, query: PhotoQuery) -> PhotoResult:
-        """Answer ``query`` about the photo in ``data`` (JPEG, PNG or WebP).
+    def estimate(
+        self, data: bytes, query: PhotoQuery, clock: StageClock | None = None
+    ) -> PhotoResult:
+        """Answer ``query`` about the photo in ``data`` (JPEG, PNG, WebP; HEIC with its extra).
 
         Raises the ``RequestError``s of ``app.imaging.decode_photo``, and ``InvalidInputError`` when
         the box lies outside the photo.
         """
-        clock = StageClock()
+        clock = StageClock() if clock is None else clock
         photo = decode_photo(
             data,
             max_pixels=self._max_pixels,
