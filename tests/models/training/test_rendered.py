@@ -149,9 +149,9 @@ def test_a_pose_sets_the_limbs_directions_and_keeps_their_lengths(
             assert cos > 0.999, (LSP14.joint_names[a], LSP14.joint_names[b])
 
 
-def test_a_mirrored_pose_gives_the_mirrored_body(poser: Poser, rest: RestBody) -> None:
+def test_a_mirrored_pose_gives_the_mirrored_body(model: BodyModel, rest: RestBody) -> None:
     rng = MeansOnly(np.random.PCG64(0))
-    neutral = Poser(poser._model, TrunkStats.of(np.stack([STANDING, mirrored(STANDING)])))
+    neutral = Poser(model, TrunkStats.of(np.stack([STANDING, mirrored(STANDING)])))
     for target in other_poses(4):
         one = neutral.pose(rest, target, rng).joints
         two = neutral.pose(rest, mirrored(target), rng).joints
