@@ -70,7 +70,7 @@ async def lift_people(request: Request, service: ServiceDep, engine: EngineDep) 
 def parse_lift_request(body: bytes) -> schemas.LiftRequest:
     """The request in ``body``; ``MalformedBodyError`` or ``InvalidInputError`` when it is none."""
     try:
-        return schemas.LiftRequest.model_validate_json(body)
+        return schemas.LiftRequest.model_validate_json(body, strict=True)
     except ValidationError as error:
         if any(item["type"] == "json_invalid" for item in error.errors()):
             raise MalformedBodyError("the body is not JSON") from error
