@@ -6,15 +6,15 @@ on the whole photo and a Convolutional Pose Machine on each person's crop.
 
 import os
 
-# onnxruntime reports its use to its makers, and keeps a database of what it has not yet sent, unless
-# told otherwise before it is first imported. This service tells nobody about its users.
+# onnxruntime reports its use to its makers, and keeps a database of what it has not yet sent,
+# unless told otherwise before it is first imported. This service tells nobody about its users.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
-from models.card import ModelCard  # noqa: E402
-from models.errors import ModelError  # noqa: E402
-from models.heatmaps import Joints2D  # noqa: E402
-from models.person_detector import PersonBox, PersonDetector  # noqa: E402
-from models.pose_estimator import PoseEstimator  # noqa: E402
+from models.card import ModelCard
+from models.errors import ModelError
+from models.heatmaps import Joints2D
+from models.person_detector import PersonBox, PersonDetector
+from models.pose_estimator import PoseEstimator
 
 __all__ = [
     "Joints2D",
