@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
+import shutil
 import subprocess
 from pathlib import Path
 
 import cv2
 import numpy as np
+from typer.testing import CliRunner, Result
 
-from app.schemas import PosesAnswer
+from app.cli import cli
+from app.schemas import BatchItem, PosesAnswer
 from app.version import VERSION
 from tests.app.conftest import RENDERS
 from tests.app.server import COMMAND, environment
+from tests.library_store.clips import clip, write_clips
 from tests.library_store.importers.files import cmu_bvh, walk
 
 
@@ -27,8 +32,21 @@ def run(*arguments: object, **settings: object) -> subprocess.CompletedProcess[s
     )
 
 
+def invoke(*arguments: object) -> Result:
+    """In this process: much faster, for what needs no engine."""
+    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
 def test_version() -> None:
     assert run("version").stdout.strip() == VERSION
+
+
+def test_help_has_examples() -> None:
+    assert "doctor" in invoke("--help").stdout
+    for command in ("serve", "predict", "evaluate", "bench", "doctor"):
+        said = invoke(command, "--help").stdout
+        # On a line of its own: help is not wrapped there.
+        assert re.search(rf"^ +(\w+=\S+ )*posematch {command}", said, re.M), said
 
 
 def test_predict(library_dir: Path, tmp_path: Path) -> None:
@@ -45,6 +63,47 @@ def test_predict(library_dir: Path, tmp_path: Path) -> None:
     assert "head_top" in table.stdout
 
 
+def test_predict_a_folder_and_a_file(library_dir: Path, tmp_path: Path) -> None:
+    """Every photo is answered or complained about; pictures have names of their own."""
+    photos = tmp_path / "photos"
+    (photos / "deeper").mkdir(parents=True)
+    shutil.copy(RENDERS / "000.jpg", photos / "a.jpg")
+    shutil.copy(RENDERS / "006.jpg", photos / "deeper" / "a.JPG")
+    (photos / "cut.jpg").write_bytes((RENDERS / "014.jpg").read_bytes()[:5000])
+    (photos / "notes.txt").write_text("not looked at")
+    pictures = tmp_path / "pictures"
+    done = run(
+        *("predict", photos, photos / "a.jpg", RENDERS / "022.jpg", "--json", "--max-people", 1),
+        *("--image", pictures, "--image-type", "svg"),
+        library_dir=library_dir,
+    )
+    assert done.returncode == 1
+    assert "3 of 4 photos answered" in done.stderr
+    (complaint,) = [line for line in done.stderr.splitlines() if "error:" in line]
+    assert "cut.jpg" in complaint
+    items = [BatchItem.model_validate_json(line) for line in done.stdout.splitlines()]
+    expected = ["a.jpg", "cut.jpg", "deeper/a.JPG"]
+    assert [it.name for it in items[:3]] == [str(photos / name) for name in expected]
+    assert [it.answer is None for it in items] == [False, True, False, False]
+    assert items[1].problem is not None
+    assert items[1].problem.type.endswith("undecodable-image")
+    assert {it.name for it in pictures.iterdir()} == {"a.svg", "a-2.svg", "022.svg"}
+
+
+def test_predict_says_what_is_wrong_with_the_command(tmp_path: Path) -> None:
+    photo = RENDERS / "000.jpg"
+    for arguments, said in (
+        ((tmp_path,), "no .jpg"),
+        ((tmp_path / "none.jpg",), "does not exist"),
+        ((photo, "--image", tmp_path / "out.gif"), ".svg"),
+        ((photo, RENDERS / "006.jpg", "--image", photo), "folder"),
+        ((photo, "--method", "magic"), "fusion"),
+    ):
+        done = invoke("predict", *arguments)
+        assert done.exit_code == 2, arguments
+        assert said in done.stderr
+
+
 def test_predict_refuses_what_is_no_photo(library_dir: Path, tmp_path: Path) -> None:
     text = tmp_path / "notes.txt"
     text.write_text("hello")
@@ -52,6 +111,37 @@ def test_predict_refuses_what_is_no_photo(library_dir: Path, tmp_path: Path) -> 
     assert done.returncode == 1
     assert "image/jpeg" in done.stderr
     assert "Traceback" not in done.stderr
+    done = run("predict", RENDERS / "000.jpg", library_dir=library_dir, max_body_bytes=1000)
+    assert done.returncode == 1
+    assert "1000 bytes" in done.stderr
+
+
+def test_bench(library_dir: Path) -> None:
+    done = run("bench", "--seconds", 0.2, "--json", library_dir=library_dir, workers=2)
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert [it["threads"] for it in report["runs"]] == [1, 2]
+    for speed in report["runs"]:
+        assert {"decode", "detect", "pose", "match", "camera", "warp"} <= speed["stages_ms"].keys()
+        assert 0 < speed["stages_ms"]["pose"] < speed["median_ms"] <= speed["p95_ms"]
+        assert speed["cpu_ms_per_photo"] > 0
+        assert speed["people"] == 1
+    table = run("bench", "--seconds", 0.2, library_dir=library_dir, workers=1)
+    assert "photos a second" in table.stdout
+
+
+def test_evaluate_lists_and_runs_programs() -> None:
+    listed = invoke("evaluate")
+    assert listed.exit_code == 0
+    names = {line.split()[0] for line in listed.stdout.splitlines()}
+    assert {"lifting", "pose2d", "renders"} <= names
+    assert "metrics" not in names, "no program"
+    helped = run("evaluate", "renders", "--help")
+    assert helped.returncode == 0
+    assert "posematch evaluate renders" in helped.stdout
+    unknown = invoke("evaluate", "luck")
+    assert unknown.exit_code == 2
+    assert "lifting" in unknown.stderr
 
 
 def test_library_import(tmp_path: Path) -> None:
@@ -77,14 +167,50 @@ def test_library_import(tmp_path: Path) -> None:
 
 
 def test_library_commands(library_dir: Path, tmp_path: Path) -> None:
-    info = run("library", "info", library_dir=library_dir)
+    info = run("library", "info", "--json", library_dir=library_dir)
     assert json.loads(info.stdout)["n_exemplars"] == 4000
+    assert "licence of CMU Graphics Lab" in run("library", "info", library_dir).stdout
     assert "whole" in run("library", "verify", library_dir=library_dir).stdout
     built = tmp_path / "tiny"
-    done = run("library", "build", "--directory", built, "--poses", 100)
+    done = run("library", "build", "--directory", built, "--size", 100)
     assert done.returncode == 0, done.stderr
     (built / "cameras.npy").write_bytes(b"oops")
-    broken = run("library", "verify", library_dir=built)
+    broken = run("library", "verify", built)
     assert broken.returncode == 1
+    assert "error:" in broken.stderr
     assert "cameras.npy" in broken.stderr
     assert "Traceback" not in broken.stderr
+    assert "needs --directory" in run("library", "build", "--size", 9).stderr
+
+
+def test_a_library_of_ones_own(tmp_path: Path) -> None:
+    """Import, build, look, merge: what the documentation shows."""
+    files = {name: tmp_path / f"{name}.npz" for name in "ab"}
+    write_clips(files["a"], clip("dance", 120, 1, licence=""))
+    write_clips(files["b"], clip("walk", 90, 2, licence="CC BY 4.0"))
+    own = tmp_path / "own"
+    build = ("library", "build", "--directory", own, "--from", files["a"], "--from", files["b"])
+    refused = run(*build, "--size", 500)
+    assert refused.returncode == 1
+    assert "a.npz: does not say under which licence clip 'dance'" in refused.stderr
+    done = run(*build, "--size", 500, "--licence", "ours", "--radius-mm", 5)
+    assert done.returncode == 0, done.stderr
+    assert "licence of a.npz: ours\nlicence of b.npz: CC BY 4.0" in done.stdout
+    info = run("library", "info", own).stdout
+    assert "radius_mm 5.0" in info
+    assert "licence of b.npz: CC BY 4.0" in info
+    sheet = tmp_path / "sheet.png"
+    sampled = run("library", "sample", own, "--out", sheet, "--count", 6, "--kind", "composed")
+    assert "6 of 500 exemplars" in sampled.stdout
+    picture = cv2.imread(str(sheet))
+    assert picture is not None
+    assert "--kind" in run("library", "sample", own, "--kind", "dreamt").stderr
+    other = tmp_path / "other"
+    both = (*build[:3], other, "--from", files["b"], "--prior", "default", "--size", 200)
+    assert run(*both).returncode == 0
+    merged = tmp_path / "merged"
+    done = run("library", "merge", own, other, "--directory", merged)
+    assert done.returncode == 0, done.stderr
+    manifest = json.loads(run("library", "info", merged, "--json").stdout)
+    assert manifest["n_exemplars"] == 700
+    assert {it["licence"] for it in manifest["licences"]} >= {"ours", "CC BY 4.0"}

@@ -1,0 +1,324 @@
+"""``posematch doctor``: whether this machine and these settings can serve, and what to mend."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import os
+import shutil
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Literal
+from urllib import request
+from urllib.error import URLError
+
+import numpy as np
+import onnxruntime as ort
+import typer
+from rich.markup import escape
+
+from app.commands.bench import SAMPLE
+from app.commands.console import output
+from app.commands.machine import cpu_flags, describe_cpu, memory
+from app.engine import load_engine
+from app.errors import StartupError
+from app.pipeline import PhotoQuery
+from app.settings import Settings, load_settings
+from library_store.build import default_library_dir, verify_library
+from library_store.errors import LibraryError
+from models.card import read_card, read_weights
+from models.errors import ModelError
+
+State = Literal["ok", "warning", "failure"]
+_COLOURS: dict[State, str] = {"ok": "green", "warning": "yellow", "failure": "red"}
+
+SERVING_BYTES = 450_000_000
+"""Memory of a serving process with the default library, with room for a few large photos."""
+BUILDING_BYTES = 1_500_000_000
+LIBRARY_BYTES = 250_000_000
+"""Disk space a build of the default library takes while it runs."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at; ``mend`` says what to do where it is not well."""
+
+    name: str
+    state: State
+    said: str
+    mend: str = ""
+
+
+def doctor(
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Check that this machine can serve.
+
+    Looks at settings, machine, weights, library, cache and port, and says what to mend.
+    Builds nothing and changes nothing. Exit code: 0 when it can serve, 1 when it cannot.
+
+    \b
+    posematch doctor
+    POSEMATCH_PORT=9000 POSEMATCH_LIBRARY_DIR=/data/ours posematch doctor
+    """  # noqa: D301
+    findings = []
+    for finding in examine():
+        findings.append(finding)
+        if not as_json:
+            _print(finding)
+    failed = any(finding.state == "failure" for finding in findings)
+    if as_json:
+        report = {"can_serve": not failed, "findings": [asdict(it) for it in findings]}
+        output.print_json(json.dumps(report))
+    if failed:
+        raise typer.Exit(1)
+
+
+def examine() -> Iterator[Finding]:
+    """All findings, one after another; without readable settings there is only the first."""
+    yield _software()
+    try:
+        settings = load_settings()
+    except StartupError as error:
+        yield Finding("settings", "failure", str(error), "correct the environment variables")
+        return
+    yield _settings()
+    yield _cpu()
+    yield _memory(settings)
+    yield _cache(settings)
+    yield _disk(settings)
+    yield _port(settings)
+    yield _exposure(settings)
+    weights = [_weights(settings.weights_dir, name) for name in (settings.model, "person")]
+    yield from weights
+    library = _library(settings)
+    yield library
+    if library.state == "ok" and all(finding.state == "ok" for finding in weights):
+        yield _photo(settings)
+
+
+def _software() -> Finding:
+    names = ("posematch", "onnxruntime", "hnswlib", "numpy", "opencv-python-headless")
+    versions = [f"Python {sys.version.split()[0]}", *(f"{it} {_version(it)}" for it in names)]
+    providers = ", ".join(ort.get_available_providers())
+    return Finding("software", "ok", f"{', '.join(versions)}; onnxruntime can use {providers}")
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "under another name"
+
+
+def _settings() -> Finding:
+    given = sorted(name for name in os.environ if name.upper().startswith("POSEMATCH_"))
+    return Finding("settings", "ok", f"set: {', '.join(given)}" if given else "all defaults")
+
+
+def _cpu() -> Finding:
+    flags = cpu_flags()
+    if "avx2" in flags or "asimd" in flags:
+        return Finding("CPU", "ok", describe_cpu())
+    return Finding(
+        "CPU",
+        "warning",
+        describe_cpu(),
+        "without AVX2 (or ARM's ASIMD) the networks run several times slower; raise "
+        "POSEMATCH_DEADLINE_MS, or use another machine",
+    )
+
+
+def _memory(settings: Settings) -> Finding:
+    free = memory()
+    if free is None:
+        return Finding(
+            "memory", "warning", "unknown here", f"see that {_mb(SERVING_BYTES)} are free"
+        )
+    wanted = SERVING_BYTES if _is_library_there(settings) else BUILDING_BYTES
+    said = f"{_mb(free.available_bytes)} free"
+    if free.container_limit_bytes is not None:
+        said += f", this container's limit is {_mb(free.container_limit_bytes)}"
+    if free.available_bytes >= wanted:
+        return Finding("memory", "ok", said)
+    what = "serving" if wanted == SERVING_BYTES else "building the library"
+    return Finding(
+        "memory",
+        "warning",
+        said,
+        f"{what} takes {_mb(wanted)}; free some, or raise the limit",
+    )
+
+
+def _cache(settings: Settings) -> Finding:
+    directory = settings.cache_dir
+    if settings.library_dir is not None:
+        return Finding("cache", "ok", "not needed: POSEMATCH_LIBRARY_DIR is set")
+    nearest = next(it for it in (directory, *directory.parents) if it.exists())
+    try:
+        with tempfile.TemporaryFile(dir=nearest):
+            pass
+    except OSError as error:
+        return Finding(
+            "cache",
+            "ok" if _is_library_there(settings) else "failure",
+            f"{directory} is not writable: {error.strerror}",
+            "make it writable, or set POSEMATCH_CACHE_DIR to a directory that is",
+        )
+    return Finding("cache", "ok", f"{directory} is writable")
+
+
+def _disk(settings: Settings) -> Finding:
+    directory = settings.cache_dir
+    nearest = next(it for it in (directory, *directory.parents) if it.exists())
+    free = shutil.disk_usage(nearest).free
+    if free >= LIBRARY_BYTES or _is_library_there(settings):
+        return Finding("disk", "ok", f"{_mb(free)} free at {nearest}")
+    return Finding(
+        "disk",
+        "failure",
+        f"{_mb(free)} free at {nearest}",
+        f"building the library takes {_mb(LIBRARY_BYTES)}; free some, or set POSEMATCH_CACHE_DIR",
+    )
+
+
+def _port(settings: Settings) -> Finding:
+    place = f"{settings.host}:{settings.port}"
+    try:
+        info = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(info[0], socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(info[4])
+    except OSError as error:
+        if _answers(settings):
+            return Finding("port", "ok", f"posematch is already serving on {place}")
+        return Finding(
+            "port",
+            "failure",
+            f"{place} cannot be had: {error.strerror}",
+            "stop what uses it, or set POSEMATCH_HOST and POSEMATCH_PORT to others",
+        )
+    return Finding("port", "ok", f"{place} is free")
+
+
+def _answers(settings: Settings) -> bool:
+    """Whether a posematch is what listens there."""
+    host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(settings.host, settings.host)
+    try:
+        with request.urlopen(f"http://{host}:{settings.port}/openapi.json", timeout=2) as answer:
+            document = json.load(answer)
+    except (URLError, OSError, ValueError):
+        return False
+    return isinstance(document, dict) and document.get("info", {}).get("title") == "posematch"
+
+
+def _exposure(settings: Settings) -> Finding:
+    try:
+        is_local = ipaddress.ip_address(settings.host).is_loopback
+    except ValueError:
+        is_local = settings.host == "localhost"
+    if is_local:
+        return Finding("access", "ok", "this machine only")
+    if settings.api_keys:
+        return Finding("access", "ok", f"the network, with {len(settings.api_keys)} API keys")
+    return Finding(
+        "access",
+        "warning",
+        "everybody who reaches this address can use it",
+        "set POSEMATCH_API_KEYS, or keep it behind something that checks",
+    )
+
+
+def _weights(directory: Path, name: str) -> Finding:
+    path = directory / f"{name}.json"
+    try:
+        card = read_card(path)
+        read_weights(directory / card.file, card)
+    except ModelError as error:
+        return Finding(f"weights of {name}", "failure", *_split(str(error)))
+    except OSError as error:
+        said = f"{path} cannot be read: {error.strerror}"
+        return Finding(f"weights of {name}", "failure", said, "make it readable")
+    whole = f"{card.name} {card.version}, sha256 {card.sha256[:12]}… as its card says"
+    return Finding(f"weights of {name}", "ok", whole)
+
+
+def _library(settings: Settings) -> Finding:
+    directory = settings.library_dir or default_library_dir(settings.cache_dir)
+    if settings.library_dir is None and not directory.exists():
+        return Finding(
+            "library",
+            "warning",
+            "not built yet",
+            "the first start builds it, in a minute or two; to do it now: posematch library build",
+        )
+    try:
+        manifest = verify_library(directory)
+    except LibraryError as error:
+        said, mend = _split(str(error))
+        rebuilt = "delete that directory; the next start builds it again"
+        return Finding("library", "failure", said, mend or rebuilt)
+    except OSError as error:
+        said = f"{directory} cannot be read: {error.strerror}"
+        return Finding("library", "failure", said, "make it readable")
+    said = f"{manifest.name} {manifest.version}, {manifest.n_exemplars} exemplars, sums as written"
+    return Finding("library", "ok", f"{said}; {directory}")
+
+
+def _photo(settings: Settings) -> Finding:
+    """The whole way, as a request would go."""
+    try:
+        engine = load_engine(settings)
+    except StartupError as error:
+        return Finding("a photo", "failure", *_split(str(error)))
+    data = SAMPLE.read_bytes()
+    times_ms = []
+    for _ in range(5):
+        started_s = time.perf_counter()
+        people = engine.pipeline.estimate(data, PhotoQuery()).people
+        times_ms.append(1e3 * (time.perf_counter() - started_s))
+    engine.library.close()
+    median_ms = float(np.median(times_ms))
+    said = f"{len(people)} of 1 person found, {median_ms:.0f} ms"
+    if not people:
+        return Finding(
+            "a photo", "failure", said, "the model finds nobody in the sample: use other weights"
+        )
+    if median_ms > settings.deadline_ms:
+        return Finding(
+            "a photo",
+            "warning",
+            f"{said}, more than the deadline of {settings.deadline_ms:g} ms",
+            "free the machine, or raise POSEMATCH_DEADLINE_MS; posematch bench shows the stages",
+        )
+    return Finding("a photo", "ok", said)
+
+
+def _is_library_there(settings: Settings) -> bool:
+    return (settings.library_dir or default_library_dir(settings.cache_dir)).exists()
+
+
+def _split(message: str) -> tuple[str, str]:
+    """Our error messages say what is wrong; then, after a semicolon, how to mend it."""
+    said, _, mend = message.partition("; ")
+    return said, mend
+
+
+def _mb(size_bytes: int) -> str:
+    return f"{size_bytes / 1e6:.0f} MB" if size_bytes < 10e9 else f"{size_bytes / 1e9:.0f} GB"
+
+
+def _print(finding: Finding) -> None:
+    colour = _COLOURS[finding.state]
+    line = (
+        f"[{colour}]{finding.state:>7}[/{colour}]  {escape(finding.name)}: {escape(finding.said)}"
+    )
+    output.print(line, highlight=False, soft_wrap=True)
+    if finding.state != "ok" and finding.mend:
+        output.print(f"{'':>9}{escape(finding.mend)}", highlight=False, soft_wrap=True)

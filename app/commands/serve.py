@@ -1,0 +1,59 @@
+"""``posematch serve``: the HTTP service."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Annotated
+
+import typer
+import uvicorn
+
+from app.commands.console import build_if_missing
+from app.connection import connection_class
+from app.errors import StartupError
+from app.main import create_app
+from app.observability import configure_logging
+from app.settings import load_settings
+
+
+def serve(
+    host: Annotated[str | None, typer.Option(help="Address; default POSEMATCH_HOST.")] = None,
+    port: Annotated[int | None, typer.Option(help="Port; default POSEMATCH_PORT.")] = None,
+) -> None:
+    """Serve the API and the page.
+
+    Builds the default library first when it is not there yet.
+
+    \b
+    posematch serve
+    posematch serve --host 0.0.0.0 --port 9000
+    POSEMATCH_WORKERS=1 POSEMATCH_DEADLINE_MS=500 posematch serve
+    """  # noqa: D301
+    given = {"host": host, "port": port}
+    settings = load_settings(**{name: value for name, value in given.items() if value is not None})
+    build_if_missing(settings)
+    configure_logging(settings.log_level)
+
+    def stop(_: StartupError) -> None:
+        server.should_exit = True
+
+    app = create_app(settings, on_startup_failure=stop)
+    server = uvicorn.Server(
+        uvicorn.Config(
+            app,
+            host=settings.host,
+            port=settings.port,
+            http=connection_class(settings.upload_timeout_s),
+            lifespan="on",
+            ws="none",
+            access_log=False,
+            log_config=None,
+            server_header=False,
+            timeout_keep_alive=settings.keep_alive_s,
+            timeout_graceful_shutdown=settings.shutdown_grace_s,
+        )
+    )
+    with suppress(KeyboardInterrupt):  # uvicorn shuts down in order, then raises it again
+        server.run()
+    if app.state.service.startup_error is not None:
+        raise app.state.service.startup_error

@@ -1,0 +1,114 @@
+"""`posematch doctor`: what is well is said so, what is not is named with what to do."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.commands.machine import cpu_flags, describe_cpu, memory
+from app.settings import Settings
+from tests.app.server import Server, free_port
+from tests.app.test_cli import run
+
+WEIGHTS = Settings().weights_dir
+
+
+def examine(expected: int, **settings: object) -> dict[str, dict[str, Any]]:
+    done = run("doctor", "--json", **{"port": free_port(), **settings})
+    assert done.returncode == expected, done.stdout + done.stderr
+    report = json.loads(done.stdout)
+    assert report["can_serve"] == (expected == 0)
+    return {finding["name"]: finding for finding in report["findings"]}
+
+
+def test_all_is_well(library_dir: Path) -> None:
+    findings = examine(0, library_dir=library_dir, deadline_ms=60_000)
+    assert {it["state"] for it in findings.values()} <= {"ok", "warning"}
+    assert findings["a photo"]["state"] == "ok"
+    assert "1 of 1 person found" in findings["a photo"]["said"]
+    said = run("doctor", library_dir=library_dir, port=free_port(), deadline_ms=60_000).stdout
+    assert "ok  library: small 1, 4000 exemplars" in said
+
+
+def test_nothing_is_built(tmp_path: Path) -> None:
+    findings = examine(0, cache_dir=tmp_path / "cache")
+    assert findings["library"]["state"] == "warning"
+    assert "posematch library build" in findings["library"]["mend"]
+    assert "a photo" not in findings
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_settings() -> None:
+    findings = examine(1, workers=0)
+    assert "POSEMATCH_WORKERS" in findings["settings"]["said"]
+
+
+def test_broken_weights(tmp_path: Path) -> None:
+    weights = tmp_path / "weights"
+    shutil.copytree(WEIGHTS, weights)
+    (weights / "cpm.onnx").write_bytes(b"oops")
+    (weights / "person.onnx").unlink()
+    findings = examine(1, weights_dir=weights, cache_dir=tmp_path / "cache")
+    for name, said in (("cpm", "do not match"), ("person", "missing")):
+        finding = findings[f"weights of {name}"]
+        assert finding["state"] == "failure"
+        assert said in finding["said"]
+        assert "restore" in finding["mend"]
+
+
+def test_a_broken_library(library_dir: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken"
+    shutil.copytree(library_dir, broken)
+    poses = broken / "poses.npy"
+    data = bytearray(poses.read_bytes())
+    data[-1] ^= 1
+    poses.write_bytes(data)
+    findings = examine(1, library_dir=broken)
+    assert findings["library"]["state"] == "failure"
+    assert "poses.npy" in findings["library"]["said"]
+    assert findings["library"]["mend"]
+
+
+def test_a_cache_that_is_no_directory(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    findings = examine(1, cache_dir=file / "cache")
+    assert findings["cache"]["state"] == "failure"
+    assert "POSEMATCH_CACHE_DIR" in findings["cache"]["mend"]
+
+
+def test_the_port(tmp_path: Path, server: Server) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        findings = examine(1, port=taken.getsockname()[1], cache_dir=tmp_path)
+    assert findings["port"]["state"] == "failure"
+    assert "POSEMATCH_PORT" in findings["port"]["mend"]
+    findings = examine(0, port=server.port, cache_dir=tmp_path)
+    assert "already serving" in findings["port"]["said"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "state"),
+    [
+        ({"host": "127.0.0.1"}, "ok"),
+        ({"host": "0.0.0.0"}, "warning"),
+        ({"host": "0.0.0.0", "api_keys": "0123456789abcdef"}, "ok"),
+    ],
+)
+def test_an_open_door(tmp_path: Path, settings: dict[str, str], state: str) -> None:
+    finding = examine(0, cache_dir=tmp_path, **settings)["access"]
+    assert finding["state"] == state
+    assert "0123456789abcdef" not in finding["said"]
+
+
+def test_the_machine_is_described() -> None:
+    free = memory()
+    assert free is None or free.available_bytes > 0
+    assert all(flag in describe_cpu() for flag in cpu_flags())
+    assert "core" in describe_cpu()
