@@ -16,7 +16,7 @@ import numpy.typing as npt
 from app.errors import TooManyPixelsError, UndecodableImageError
 from app.imaging.exif import read_exif
 from app.imaging.headers import ImageHeader, read_header
-from app.imaging.heic import HEIC_TYPE, decode_heic
+from app.imaging.heic import decode_heic, is_available, is_heic
 
 _REDUCED = {
     1: cv2.IMREAD_COLOR,
@@ -87,12 +87,12 @@ def decode_photo(
     Raises ``UnsupportedImageTypeError``, ``TooManyPixelsError`` (before decoding) or
     ``UndecodableImageError``.
     """
+    if is_heic(data) and is_available():
+        return _heic_photo(data, max_pixels)
     header = read_header(data)
     if header.width_px * header.height_px > max_pixels:
         raise TooManyPixelsError(header.width_px, header.height_px, max_pixels)
     exif = read_exif(header.exif)
-    if header.decoded_upright:
-        exif = replace(exif, orientation=1)
     long_side, wanted = max(header.width_px, header.height_px), side_px
     if box_px is not None:
         long_side, wanted = int(max(box_px[2:])), box_side_px
@@ -123,6 +123,21 @@ def decode_photo(
     )
 
 
+def _heic_photo(data: bytes, max_pixels: int) -> Photo:
+    """Full size and upright as libheif gives it, whatever EXIF says of the orientation."""
+    picture = decode_heic(data, max_pixels=max_pixels)
+    height, width = picture.pixels.shape[:2]
+    return Photo(
+        pixels_bgr=_opaque_bgr(picture.pixels),
+        width_px=width,
+        height_px=height,
+        orientation=1,
+        reduction=1,
+        offset_px=(0.0, 0.0),
+        exif_focal_length_px=read_exif(picture.exif).focal_length_px(width, height),
+    )
+
+
 def _bytes(pixels: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
     """What OpenCV made of bytes is bytes; its type stubs do not know."""
     return pixels.astype(np.uint8, copy=False)
@@ -136,8 +151,6 @@ def _reduction(header: ImageHeader, long_side_px: int, wanted_px: int) -> int:
 
 def _decode(data: bytes, header: ImageHeader, reduction: int) -> npt.NDArray[np.uint8]:
     """Stored pixels, not turned, as (h, w, 3) BGR uint8."""
-    if header.media_type == HEIC_TYPE:
-        return _opaque_bgr(decode_heic(data))
     flags = cv2.IMREAD_UNCHANGED if header.has_alpha else _REDUCED[reduction]
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)

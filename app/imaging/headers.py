@@ -1,4 +1,4 @@
-"""Type, size, completeness and EXIF block of a JPEG, PNG, WebP or HEIC, without decoding a pixel.
+"""Type, size, completeness and EXIF block of a JPEG, PNG or WebP, without decoding a pixel.
 
 Decoders forgive: OpenCV returns the upper half of a truncated JPEG and greys the rest. The walks
 below go over the container to its end, so that a truncated file is an error, and they bound the
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 from app.errors import UndecodableImageError, UnsupportedImageTypeError
-from app.imaging.heic import HEIC_TYPE, is_available, is_heic, read_heic_header
+from app.imaging.heic import HEIC_TYPE, is_available, is_heic
 
 _ALWAYS_ACCEPTED = ("image/jpeg", "image/png", "image/webp")
 KNOWN_TYPES = (*_ALWAYS_ACCEPTED, HEIC_TYPE)
@@ -50,8 +50,7 @@ class ImageHeader:
     """What the container says of its image.
 
     ``width_px`` and ``height_px`` are those stored, before any EXIF orientation; ``exif`` is the
-    TIFF block of the EXIF data; ``has_alpha`` says that some pixels may be transparent;
-    ``decoded_upright`` that the decoder applies the orientation.
+    TIFF block of the EXIF data; ``has_alpha`` says that some pixels may be transparent.
     """
 
     media_type: str
@@ -59,7 +58,6 @@ class ImageHeader:
     height_px: int
     exif: bytes | None
     has_alpha: bool
-    decoded_upright: bool = False
 
 
 def accepted_types() -> tuple[str, ...]:
@@ -70,7 +68,7 @@ def accepted_types() -> tuple[str, ...]:
 def read_header(data: bytes) -> ImageHeader:
     """Read the header of ``data`` and walk its container to the end.
 
-    Raises ``UnsupportedImageTypeError`` unless the magic bytes are those of an accepted type, and
+    Raises ``UnsupportedImageTypeError`` unless the magic bytes are those of these types, and
     ``UndecodableImageError`` when the container is truncated or contradicts itself.
     """
     if data.startswith(b"\xff\xd8\xff"):
@@ -79,16 +77,6 @@ def read_header(data: bytes) -> ImageHeader:
         header = _read_png(data)
     elif data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         header = _read_webp(data)
-    elif is_heic(data) and is_available():
-        heic = read_heic_header(data)
-        header = ImageHeader(
-            HEIC_TYPE,
-            heic.width_px,
-            heic.height_px,
-            heic.exif,
-            heic.has_alpha,
-            decoded_upright=True,
-        )
     else:
         raise UnsupportedImageTypeError(_other_type(data), accepted_types())
     if header.width_px == 0 or header.height_px == 0:
