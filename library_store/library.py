@@ -25,6 +25,7 @@ from library_store.sources import (
     FRAMES_FILE,
     PARTS_FILE,
     SOURCES_FILE,
+    Kind,
     Source,
     Sources,
     read_sources,
@@ -154,6 +155,15 @@ class Library:
     def licences(self, entry: int) -> tuple[Licence, ...]:
         """Under which licences the pose of ``entry`` may be used: all of them at once."""
         return tuple(self.manifest.licences[number] for number in self.source(entry).licences)
+
+    def entries_of(self, kind: Kind) -> Entries:
+        """All entries whose poses are of one kind, ascending."""
+        runs = [np.zeros(0, dtype=np.int64)]
+        for group in self.sources.groups:
+            if group.kind == kind:
+                ends = (group.first_pose, group.first_pose + group.n_poses)
+                runs.append(np.arange(*np.searchsorted(self._projections[:, 0], ends)))
+        return np.concatenate(runs)
 
     def exemplar_id(self, entry: int) -> str:
         """The id of ``entry``: ``<library>:<source>:<clip>:<frame>:<camera>``."""

@@ -106,6 +106,14 @@ def write(path: Path, clips: Sequence[Clip]) -> None:
         unfinished.unlink(missing_ok=True)
 
 
+def states_licence(path: Path) -> bool:
+    """Whether an npz file says under which licence each of its clips may be used."""
+    npz = NpzFile(path)
+    if "positions_3d" in npz:
+        return True
+    return bool(npz.text("license")) or ("clip_license" in npz and all(npz.column("clip_license")))
+
+
 def _read_generic(path: Path, npz: NpzFile) -> list[Clip]:
     positions = _numbers(path, "positions", npz["positions"])
     n = len(positions)

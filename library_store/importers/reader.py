@@ -42,20 +42,26 @@ def find_files(paths: Iterable[Path]) -> Iterator[Path]:
             yield path
 
 
-def read_all(
+def read_each(
     paths: Iterable[Path], *, mapping: Path | None = None, strict: bool = False
-) -> tuple[list[Clip], list[MocapError]]:
-    """The clips of all files and folders, and one error for each file that was skipped.
+) -> Iterator[Clip | MocapError]:
+    """The clips of all files and folders one by one, and the error of each file that is skipped.
 
     With ``strict`` the first such error is raised instead.
     """
-    clips: list[Clip] = []
-    skipped: list[MocapError] = []
     for path in find_files(paths):
         try:
-            clips += read(path, mapping=mapping)
+            yield from read(path, mapping=mapping)
         except MocapError as error:
             if strict:
                 raise
-            skipped.append(error)
-    return clips, skipped
+            yield error
+
+
+def read_all(
+    paths: Iterable[Path], *, mapping: Path | None = None, strict: bool = False
+) -> tuple[list[Clip], list[MocapError]]:
+    """What :func:`read_each` yields, clips and errors apart."""
+    found = list(read_each(paths, mapping=mapping, strict=strict))
+    clips = [it for it in found if isinstance(it, Clip)]
+    return clips, [it for it in found if isinstance(it, MocapError)]
