@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -18,6 +18,7 @@ from library_store.build import ensure_default_library
 from library_store.errors import LibraryError
 from library_store.library import Library
 from library_store.library import load as load_library
+from library_store.manifest import read_manifest
 from models import ModelCard, ModelError, PersonDetector, PoseEstimator
 
 Progress = Callable[[str, float], None]
@@ -31,6 +32,8 @@ class Engine:
 
     library: Library
     card: ModelCard
+    detector: PersonDetector
+    estimator: PoseEstimator
     pipeline: Pipeline
     photo_s: float
 
@@ -64,19 +67,46 @@ def load_engine(settings: Settings) -> Engine:
         detector = PersonDetector(weights_dir=settings.weights_dir)
     except ModelError as error:
         raise StartupError(str(error)) from error
+    library = _open_library(locate_library(settings), settings)
+    pipeline = _assemble(detector, estimator, library, settings)
+    return Engine(library, estimator.card, detector, estimator, pipeline, _warm_up(pipeline))
+
+
+def reload_engine(engine: Engine, settings: Settings) -> Engine | None:
+    """The engine with the library as it now lies on the disk, verified and warm; blocking.
+
+    None when that is the library it has. The networks are shared with ``engine``, which stays in
+    service meanwhile. Raises ``StartupError`` when the library cannot be used.
+    """
     directory = locate_library(settings)
     try:
-        library = load_library(directory, exact_index=settings.exact_index)
+        if read_manifest(directory) == engine.library.manifest:
+            return None
     except LibraryError as error:
         raise StartupError(str(error)) from error
-    pipeline = Pipeline(
+    library = _open_library(directory, settings)
+    pipeline = _assemble(engine.detector, engine.estimator, library, settings)
+    _warm_up(pipeline)
+    return replace(engine, library=library, pipeline=pipeline)
+
+
+def _open_library(directory: Path, settings: Settings) -> Library:
+    try:
+        return load_library(directory, exact_index=settings.exact_index)
+    except LibraryError as error:
+        raise StartupError(str(error)) from error
+
+
+def _assemble(
+    detector: PersonDetector, estimator: PoseEstimator, library: Library, settings: Settings
+) -> Pipeline:
+    return Pipeline(
         detector,
         estimator,
         Lifter(library, LiftingSettings(shortlist=settings.shortlist)),
         max_pixels=settings.max_pixels,
         decode_side_px=settings.decode_side_px,
     )
-    return Engine(library, estimator.card, pipeline, _warm_up(pipeline))
 
 
 def _warm_up(pipeline: Pipeline) -> float:

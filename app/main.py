@@ -11,7 +11,7 @@ import gc
 import logging
 import signal
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 
 from fastapi import FastAPI
@@ -25,6 +25,7 @@ from app.api.shedding import SheddingMiddleware
 from app.engine import load_engine
 from app.errors import StartupError
 from app.observability import RequestContextMiddleware
+from app.reload import Reloader, describe
 from app.settings import Settings, load_settings
 from app.version import VERSION
 
@@ -64,12 +65,7 @@ def create_app(
             service.startup_error = StartupError(f"unexpected {type(error).__name__}: {error}")
             on_startup_failure(service.startup_error)
             return
-        manifest = engine.library.manifest
-        service.metrics.describe(
-            version=VERSION,
-            model=f"{engine.card.name} {engine.card.version}",
-            library=f"{manifest.name} {manifest.version}",
-        )
+        describe(service, engine)
         # What was loaded stays: let the collector not walk over it again and again.
         gc.collect()
         gc.freeze()
@@ -80,11 +76,16 @@ def create_app(
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         starting = asyncio.create_task(start())
+        reloader = Reloader(service)
+        loop = asyncio.get_running_loop()
+        with suppress(RuntimeError, ValueError):  # only a main thread hears signals
+            loop.add_signal_handler(signal.SIGHUP, reloader.request)
         try:
             yield
         finally:
             service.stopping = True
             await starting
+            await reloader.finish()
             await asyncio.to_thread(service.admission.close)
             if service.engine is not None:
                 service.engine.library.close()

@@ -73,6 +73,12 @@ class Metrics:
             "People unlike anything in the library",
             registry=self.registry,
         )
+        self.reloads = Counter(
+            "posematch_library_reloads",
+            "Reloads of the library: done, unchanged or refused",
+            ["outcome"],
+            registry=self.registry,
+        )
         self._running = Gauge(
             "posematch_running", "Requests being computed", registry=self.registry
         )
