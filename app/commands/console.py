@@ -20,15 +20,21 @@ notices = Console(stderr=True)
 def stage_progress() -> Iterator[Callable[[str, float], None]]:
     """A bar per stage on stderr; yields the callback that stages report their fraction to."""
     columns = (TextColumn("{task.description:>24}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=notices) as bars:
-        tasks: dict[str, TaskID] = {}
+    bars = Progress(*columns, console=notices)
+    tasks: dict[str, TaskID] = {}
 
-        def report(stage: str, fraction: float) -> None:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(stage, total=1.0)
-            bars.update(tasks[stage], completed=fraction)
+    def report(stage: str, fraction: float) -> None:
+        if not tasks:
+            bars.start()  # not before there is something to say: stderr may be a full disk
+        if stage not in tasks:
+            tasks[stage] = bars.add_task(stage, total=1.0)
+        bars.update(tasks[stage], completed=fraction)
 
+    try:
         yield report
+    finally:
+        if tasks:
+            bars.stop()
 
 
 def build_if_missing(settings: Settings) -> Path:
