@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import socket
 from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner, Result
 
+from app.cli import cli
 from app.commands.machine import cpu_flags, describe_cpu, memory
 from app.settings import Settings
 from tests.app.server import Server, free_port
-from tests.app.test_cli import run
 
 WEIGHTS = Settings().weights_dir
 
 
+def run(*arguments: str, **settings: object) -> Result:
+    """In this process, with these settings and no others."""
+    others = {name: None for name in os.environ if name.upper().startswith("POSEMATCH_")}
+    given = {f"POSEMATCH_{name.upper()}": str(value) for name, value in settings.items()}
+    return CliRunner(env={**others, **given}).invoke(cli, arguments)
+
+
 def examine(expected: int, **settings: object) -> dict[str, dict[str, Any]]:
     done = run("doctor", "--json", **{"port": free_port(), **settings})
-    assert done.returncode == expected, done.stdout + done.stderr
+    assert done.exit_code == expected, done.output
     report = json.loads(done.stdout)
     assert report["can_serve"] == (expected == 0)
     return {finding["name"]: finding for finding in report["findings"]}

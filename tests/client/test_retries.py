@@ -180,5 +180,5 @@ def test_retry_after_is_seconds_or_a_date() -> None:
 def test_senseless_patience() -> None:
     for bad in ({"deadline_s": 0}, {"attempts": 0}):
         with pytest.raises(ValueError, match="attempts"):
-            Retries(**bad)  # type: ignore[arg-type]
+            Retries(**bad)
     assert 408 not in RETRIED_STATUSES
