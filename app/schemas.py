@@ -34,7 +34,7 @@ MAX_CANDIDATES = 50
 MAX_COORDINATE_PX = 1e6
 MAX_GIVEN_JOINTS = max(c.skeleton.n_joints for c in CONVERSIONS.values())
 
-FocalLengthPx = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
+FocalLengthPx = Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
 SubjectHeightMm = Annotated[float, Field(ge=300, le=3000, allow_inf_nan=False)]
 Candidates = Annotated[int, Field(ge=0, le=MAX_CANDIDATES)]
 

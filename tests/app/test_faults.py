@@ -195,18 +195,21 @@ def test_health_is_never_in_the_queue(narrow_server: Server, photo: bytes) -> No
         while not ended.is_set():
             httpx.post(narrow_server.url + "/v1/poses", content=photo, timeout=60)
 
+    spent_ms: list[float] = []
     crowd = [threading.Thread(target=client) for _ in range(6)]
     for thread in crowd:
         thread.start()
-    spent_s = []
     try:
+        while narrow_server.metric("posematch_running") == 0:
+            time.sleep(0.01)
         for _ in range(20):
             for path in ("/livez", "/readyz", "/metrics"):
-                started = time.monotonic()
-                assert narrow_server.client.get(path).status_code == 200
-                spent_s.append(time.monotonic() - started)
+                response = narrow_server.client.get(path)
+                assert response.status_code == 200
+                # In the service itself: how soon the machine lets it run is another matter.
+                spent_ms.append(float(response.headers["server-timing"].partition("dur=")[2]))
     finally:
         ended.set()
         for thread in crowd:
             thread.join()
-    assert sorted(spent_s)[len(spent_s) // 2] < 0.1
+    assert sorted(spent_ms)[len(spent_ms) // 2] < 50
