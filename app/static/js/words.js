@@ -72,12 +72,18 @@ export function summaryOf(answer, person) {
 export function sourceInWords(candidate, source) {
   const chance = `${(100 * candidate.probability).toFixed(1)}% probable`;
   const error = `${candidate.reprojection_error_px.toFixed(1)} px off the joints`;
-  const origin = !source
-    ? candidate.id
-    : source.kind === "mocap"
-      ? `captured: ${source.clip}, frame ${source.frame}`
-      : `sampled from the prior ${source.prior}, draw ${source.index.toLocaleString("en")}`;
-  return `${chance}, ${error}; ${origin}`;
+  return `${chance}, ${error}; ${originOf(source) ?? candidate.id}`;
+}
+
+function originOf(source) {
+  switch (source?.kind) {
+    case "mocap":
+      return `captured: ${source.clip}, frame ${source.frame}${source.mirrored ? ", mirrored" : ""}`;
+    case "composed":
+      return `composed: ${source.parts.map((it) => `${it.part.replace("_", " ")} of ${it.clip}`).join(", ")}`;
+    case "sampled":
+      return `sampled from the prior ${source.prior}, draw ${source.index.toLocaleString("en")}`;
+  }
 }
 
 /** The line below the photo. */
