@@ -43,10 +43,16 @@ def main() -> None:
         overload = open_loop(service, request, rate, seconds)
         report(f"offered {rate:.0f}/s (open loop)", overload, service)
     share = overload.goodput / capacity.goodput
+    per_cpu = _answers_per_cpu_s(overload) / _answers_per_cpu_s(capacity)
     print(f"\ngoodput {100 * share:.0f}% of capacity")
+    print(f"answers per CPU second of the server: {100 * per_cpu:.0f}% of those at capacity")
     strange = set(overload.statuses) - {200, 503}
     if strange or overload.broken or share < WANTED_GOODPUT:
         sys.exit(f"failed: statuses {strange or 'fine'}, {overload.broken} broken, {share:.2f}")
+
+
+def _answers_per_cpu_s(load: Load) -> float:
+    return load.statuses[200] / load.server_cpu_s
 
 
 def report(title: str, load: Load, service: Service) -> None:
