@@ -5,18 +5,25 @@ which marker, or the mean of which markers, each joint is. A file may hold sever
 apart by the prefix of their markers (``Ann:LFHD``): each becomes a clip. Gaps of up to a tenth of a
 second are filled along straight lines; frames with longer ones are dropped.
 
-Reading needs ezc3d, of the extra ``mocap``.
+Reading needs ezc3d, of the extra ``mocap``. It crashes on some damaged files and therefore runs in
+a process of its own, ``c3d_child``.
 """
 
 from __future__ import annotations
 
+import io
+import re
 import struct
+import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from library_store.importers.asf_amc import CMU_LICENCE, describe_cmu
 from library_store.importers.checks import checked
@@ -33,13 +40,14 @@ from library_store.importers.markers import (
 from library_store.importers.rotation import up_to_y
 
 LONGEST_GAP_S = 0.1
+TIMEOUT_S = 300.0
 
 _MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 _CMU = MARKER_SETS[0].name
 _MIPS = bytes([86])
 """The processor type whose numbers have their high byte first."""
 _MANY = 65_535
-"""The header cannot count further; longer files are not held against it."""
+"""The header cannot count further; longer files are not held against it. No rate is so high."""
 
 
 @dataclass(frozen=True)
@@ -97,28 +105,14 @@ def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
 
 def parse(path: Path) -> C3dFile:
     """Read a C3D file; ``MocapError`` where it is not a whole one or ezc3d is not installed."""
-    try:
-        from ezc3d import c3d
-    except ImportError as error:
+    if find_spec("ezc3d") is None:
         raise MocapError(
             path, "C3D files need ezc3d: install posematch with its extra, posematch[mocap]"
-        ) from error
-    if not path.is_file():
-        raise FileNotFoundError(2, "No such file", str(path))
-    try:
-        content = c3d(str(path))
-        parameters = content["parameters"]
-        point = parameters["POINT"]
-        points = np.asarray(content["data"]["points"][:3], dtype=np.float64).transpose(1, 2, 0)
-        first, last = _frame_range(path)
-        names = [
-            str(name).strip()
-            for key in ("LABELS", "LABELS2", "LABELS3", "LABELS4")
-            for name in (point[key]["value"] if key in point else ())
-        ]
-        rate_hz = float(point["RATE"]["value"][0])
-    except (OSError, RuntimeError, LookupError, ValueError, MemoryError, struct.error) as error:
-        raise MocapError(path, f"not a whole C3D file: {error}") from error
+        )
+    with path.open("rb") as file:
+        first, last = _frame_range(path, file)
+    found = _in_child(path)
+    points, names = found["points"].astype(np.float64), found["names"].tolist()
     cut = last < _MANY and points.shape[1] != last + 1 - first
     if cut or len(names) < len(points) or not points.size:
         raise MocapError(
@@ -126,21 +120,46 @@ def parse(path: Path) -> C3dFile:
             f"not a whole C3D file: {last + 1 - first} frames announced, {points.shape[1]} found; "
             f"{len(points)} markers with {len(names)} names",
         )
-    unit = _text(point, "UNITS").lower()
+    unit = str(found["unit"]).lower()
     findings = () if unit in _MM_PER_UNIT else (f"unit of length {unit!r}: mm assumed",)
     people: dict[str, dict[str, Float]] = {}
     for name, track in zip(names, points * _MM_PER_UNIT.get(unit, 1.0), strict=False):
         person, _, marker = name.rpartition(":")
         people.setdefault(person, {}).setdefault(marker.upper(), track)
-    stated = parameters.get("PROCESSING", {})
+    rate_hz, up = float(found["rate_hz"]), str(found["up"]).upper()
     return C3dFile(
         people=people,
         first=first,
-        rate_hz=rate_hz if rate_hz > 0.0 else float("nan"),
-        up=_text(point, "Y_SCREEN").upper(),
-        stated={name: _number(stated, name) for name in stated},
+        rate_hz=rate_hz if 0.0 < rate_hz < _MANY else float("nan"),
+        up=up if re.fullmatch(r"[+-]?[XYZ]", up) else "",
+        stated=dict(zip(found["stated"].tolist(), found["values"].tolist(), strict=True)),
         findings=findings,
     )
+
+
+def _in_child(path: Path) -> dict[str, NDArray[Any]]:
+    """What ``c3d_child`` finds in a file, or ``MocapError``."""
+    command = [sys.executable, "-P", str(Path(__file__).with_name("c3d_child.py")), str(path)]
+    try:
+        child = subprocess.run(command, capture_output=True, timeout=TIMEOUT_S, check=True)
+        with np.load(io.BytesIO(child.stdout), allow_pickle=False) as found:
+            return {name: found[name] for name in found.files}
+    except subprocess.TimeoutExpired as error:
+        raise MocapError(path, f"not a whole C3D file: not read in {TIMEOUT_S:.0f} s") from error
+    except subprocess.CalledProcessError as error:
+        said = error.stderr.decode(errors="replace").strip().splitlines()
+        reason = said[-1] if said and error.returncode > 0 else "ezc3d crashes on it"
+        raise MocapError(path, f"not a whole C3D file: {reason}") from error
+
+
+def _frame_range(path: Path, file: BinaryIO) -> tuple[int, int]:
+    """Numbers of the first and last frame by the header, which ezc3d mends where a file is cut."""
+    header = file.read(512)
+    if len(header) < 512 or not header[0]:
+        raise MocapError(path, "not a whole C3D file: it has no header")
+    file.seek(512 * (header[0] - 1) + 3)
+    first, last = struct.unpack_from(">HH" if file.read(1) == _MIPS else "<HH", header, 6)
+    return first, last
 
 
 def _joints_of(
@@ -169,25 +188,3 @@ def _joints_of(
         return np.stack(means, axis=1), name, findings
     assert marker_set is not None
     return joint_centres(marker_set, filled, sizes), name, findings
-
-
-def _frame_range(path: Path) -> tuple[int, int]:
-    """Numbers of the first and last frame by the header, which ezc3d mends where a file is cut."""
-    with path.open("rb") as file:
-        header = file.read(512)
-        file.seek(512 * (header[0] - 1) + 3)
-        processor = file.read(1)
-    first, last = struct.unpack_from(">HH" if processor == _MIPS else "<HH", header, 6)
-    return first, last
-
-
-def _text(group: Any, name: str) -> str:
-    values = group[name]["value"] if name in group else []
-    return str(values[0]).strip() if len(values) else ""
-
-
-def _number(group: Any, name: str) -> float:
-    try:
-        return float(group[name]["value"][0])
-    except (KeyError, IndexError, TypeError, ValueError):
-        return 0.0

@@ -101,6 +101,15 @@ def test_noise_is_refused(tmp_path: Path) -> None:
         read(path)
 
 
+def test_a_file_that_crashes_the_reader_is_refused_too(tmp_path: Path) -> None:
+    path = write_c3d(tmp_path / "bad.c3d", turning(standing(), 4))
+    content = bytearray(path.read_bytes())
+    content[525] = 255  # a parameter's name is longer than it is
+    path.write_bytes(content)
+    with pytest.raises(MocapError, match=r"bad\.c3d: not a whole C3D file: ezc3d crashes on it"):
+        read(path)
+
+
 def test_without_the_extra_it_says_what_to_install(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
