@@ -138,7 +138,8 @@ def draw_novel_view(result: PhotoResult, view: Viewpoint, *, side_px: int) -> Pi
     grid, floor_mm = _grid(points)
 
     rotation = view.rotation()
-    seen = np.concatenate([points, pyramid, _floor_under(points, floor_mm)]) @ rotation.T
+    ghosts = [person.exemplar.joints_mm for person in people]
+    seen = np.concatenate([points, *ghosts, pyramid, grid.reshape(-1, 3)]) @ rotation.T
     low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
     scale = 0.88 * side_px / float(max(high - low))
     middle = (low + high) / 2
@@ -214,19 +215,13 @@ def _camera_marks(pyramid: Floats) -> list[Mark]:
     return [Area(corners, _GHOST, 0.25), *edges, frame]
 
 
-def _floor_under(points_mm: Floats, floor_mm: float) -> Floats:
-    """(2, 3) floor points below the people, so that their shadows are in the picture."""
-    low, high = points_mm.min(axis=0), points_mm.max(axis=0)
-    return np.array([[low[0], floor_mm, low[2]], [high[0], floor_mm, high[2]]])
-
-
 def _grid(points_mm: Floats) -> tuple[Floats, float]:
     """(L, 2, 3) lines of a half-metre grid under the points, and its height."""
     floor_mm = float(points_mm[:, 1].max())
     step = _GRID_STEP_MM
     (x0, z0), (x1, z1) = (
-        np.floor(points_mm[:, [0, 2]].min(axis=0) / step - 0.5) * step,
-        np.ceil(points_mm[:, [0, 2]].max(axis=0) / step + 0.5) * step,
+        np.floor(points_mm[:, [0, 2]].min(axis=0) / step) * step,
+        np.ceil(points_mm[:, [0, 2]].max(axis=0) / step) * step,
     )
     along_z = [[[x, floor_mm, z0], [x, floor_mm, z1]] for x in np.arange(x0, x1 + step / 2, step)]
     along_x = [[[x0, floor_mm, z], [x1, floor_mm, z]] for z in np.arange(z0, z1 + step / 2, step)]

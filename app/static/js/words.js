@@ -97,10 +97,10 @@ export function captionOf(name, answer) {
 export function viewInWords(azimuth, elevation) {
   const turn = Math.round(Math.abs(azimuth));
   const rise = Math.round(Math.abs(elevation));
-  if (turn === 0 && rise === 0) return "As the photo’s camera sees it; grid 0.5 m";
+  if (turn === 0 && rise === 0) return "As the photo’s camera sees it; grid 0.5\u00a0m";
   const sides = turn ? `${turn}° to the ${azimuth > 0 ? "right" : "left"}` : "straight on";
   const height = rise ? `, ${rise}° ${elevation > 0 ? "above" : "below"}` : "";
-  return `From ${sides}${height}; grid 0.5 m`;
+  return `From ${sides}${height}; grid 0.5\u00a0m`;
 }
 
 function metres(mm) {
