@@ -3,55 +3,40 @@
     python -m library_store.fit_prior --mocap cmu.npz --out library_store/prior_data
 
 ``--mocap`` is an .npz with ``positions`` (N, 14, 3) mm, Y up, joints in lsp14 order, ``clip`` (N,)
-and per clip ``clip_subject``. Frames of a crowded region weigh less, so that hours of walking do
-not drown the rest. Seeded; the same inputs, settings and BLAS give the same parameters.
+and per clip ``clip_subject``. Of poses that are nearly the same one is kept, so that hours of
+walking do not drown the rest. The same inputs and settings give the same bytes; takes seconds.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
-import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from library_store.anatomy import (
-    LENGTHS,
-    BodyParts,
-    Float,
-    encode,
-    measure_lengths,
-    root_of,
-)
+from library_store.anatomy import Float, encode, measure_lengths, root_of
 from library_store.limits import learn_limits
-from library_store.mixture import GaussianMixture
-from library_store.mixture_fit import FitSettings, density_weights, fit_mixture
-from library_store.prior import PosePrior, PriorCard, save_prior
+from library_store.population import Population
+from library_store.prior import Composition, Exemplars, PosePrior, PriorCard, save_prior
+from library_store.skeleton import L_HIP, R_HIP
+from library_store.thin import greedy_cover
 
 
 @dataclass(frozen=True)
 class PriorSettings:
     """How the prior is fitted and composed; all of it goes into the card.
 
-    ``cover_radius`` and ``cover_power`` thin crowded poses (:func:`density_weights`, in the units
-    of a part's vector); ``limit_quantile`` is the share of frames each limit may refuse;
-    ``proportion_spread`` scales the spread of lengths between the few subjects, below 1 because a
-    good part of it is where the joints of each fitted skeleton were put.
+    ``radius_mm``: RMS joint distance within which one pose stands for another, whichever way they
+    head; ``limit_quantile`` is the share of frames each limit may refuse.
     """
 
-    seed: int = 0
-    legs: FitSettings = field(default_factory=FitSettings)
-    upper: FitSettings = field(default_factory=FitSettings)
-    cover_radius: float = 0.3
-    cover_power: float = 0.8
-    limit_quantile: float = 0.001
-    proportion_spread: float = 0.7
-    coupling: float = 0.5
-    lying: float = 0.05
-    anyhow: float = 0.02
+    radius_mm: float = 30.0
+    limit_quantile: float = 0.0003
+    composition: Composition = field(default_factory=Composition)
+    population: Population = field(default_factory=Population)
 
 
 @dataclass(frozen=True)
@@ -74,96 +59,40 @@ def read_mocap(path: Path, exclude_subjects: tuple[str, ...] = ()) -> Mocap:
 
 
 def fit_prior(mocap: Mocap, settings: PriorSettings, card: dict[str, object]) -> PosePrior:
-    """Fit all of the prior; prints its progress."""
-    rng = np.random.default_rng(settings.seed)
-    lengths, log_lengths = _fit_lengths(mocap, settings.proportion_spread)
-    parts = encode(mocap.poses_mm, lengths)
-    legs, with_legs = _fit_part("legs", parts.legs, settings, settings.legs, rng)
-    upper, with_upper = _fit_part("upper", parts.upper, settings, settings.upper, rng)
-    weights = density_weights(_both(parts), settings.cover_radius, settings.cover_power)
-    together = (with_legs * weights[:, None]).T @ with_upper
-    # A component of the legs that no frame claims goes with any upper body.
-    together += 1e-6 * upper.weights
+    """Thin the poses, take them apart, measure their people and learn what bodies cannot do."""
+    names, subjects = np.unique(mocap.subjects, return_inverse=True)
+    measured = measure_lengths(mocap.poses_mm)
+    usual = np.stack([np.median(measured[subjects == i], axis=0) for i in range(len(names))])
+    kept = greedy_cover(face_ahead(mocap.poses_mm).astype(np.float32), settings.radius_mm)
+    parts = encode(mocap.poses_mm[kept], usual[subjects[kept]])
     notes = {**card, "settings": asdict(settings), "frames": len(mocap.poses_mm)}
     prior = PosePrior(
-        legs=legs,
-        upper=upper,
-        partners=together / together.sum(axis=1, keepdims=True),
-        log_lengths=log_lengths,
+        exemplars=Exemplars(parts.legs, parts.upper, subjects[kept], usual),
+        composition=settings.composition,
+        population=settings.population,
         limits=learn_limits(mocap.poses_mm, settings.limit_quantile),
-        coupling=settings.coupling,
-        lying=settings.lying,
-        anyhow=settings.anyhow,
         card=PriorCard(
             name=str(card["name"]), version=str(card["version"]), licences=(), notes=notes
         ),
-        sha256="",
     )
     notes["measured"] = {
-        "mean_log_probability_legs": round(_mean_log_probability(legs, parts.legs), 3),
-        "mean_log_probability_upper": round(_mean_log_probability(upper, parts.upper), 3),
-        "samples_accepted": round(prior.acceptance(20_000, rng), 3),
+        "exemplars": len(kept),
+        "subjects": len(names),
+        "samples_accepted": round(prior.acceptance(20_000, np.random.default_rng(0)), 3),
     }
     return prior
 
 
-def _mean_log_probability(mixture: GaussianMixture, samples: Float) -> float:
-    """Mean log density of frames (n, D), crowds and all."""
-    log_joint = mixture.joint_log_probability(samples)
-    top = log_joint.max(axis=1)
-    return float((top + np.log(np.exp(log_joint - top[:, None]).sum(axis=1))).mean())
-
-
-def _both(parts: BodyParts) -> Float:
-    return np.concatenate([parts.legs, parts.upper], axis=1)
-
-
-def _fit_part(
-    name: str,
-    samples: Float,
-    settings: PriorSettings,
-    fit: FitSettings,
-    rng: np.random.Generator,
-) -> tuple[GaussianMixture, Float]:
-    weights = density_weights(samples, settings.cover_radius, settings.cover_power)
-    effective = weights.sum() ** 2 / (weights**2).sum()
-    print(f"{name}: {len(samples)} frames, worth {effective:.0f}", flush=True)
-    started = time.perf_counter()
-
-    def report(iteration: int, log_probability: float) -> None:
-        if iteration % 5 == 0:
-            seconds = time.perf_counter() - started
-            print(
-                f"  {name} {iteration:3d}: mean log p {log_probability:8.4f}, {seconds:.0f} s",
-                flush=True,
-            )
-
-    return fit_mixture(samples, weights, fit, rng, report)
-
-
-def _fit_lengths(mocap: Mocap, spread: float) -> tuple[Float, GaussianMixture]:
-    """Usual lengths (n, 8) mm of each frame's person, and the population of log lengths.
-
-    Every subject counts once. With fewer than two dozen subjects the covariance is shrunk halfway
-    to common size plus independent proportions, and the standard deviations scaled by ``spread``.
-    """
-    measured = measure_lengths(mocap.poses_mm)
-    names, of_frame = np.unique(mocap.subjects, return_inverse=True)
-    usual = np.stack([np.median(measured[of_frame == i], axis=0) for i in range(len(names))])
-    logs = np.log(usual)
-    mean = logs.mean(axis=0)
-    size = (logs - mean).mean(axis=1, keepdims=True)
-    covariance = np.cov(logs, rowvar=False)
-    simple = float(size.var(ddof=1)) * np.ones_like(covariance)
-    simple += np.diag((logs - mean - size).var(axis=0, ddof=1))
-    covariance = spread**2 * 0.5 * (covariance + simple)
-    factor = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
-    for name, length, relative in zip(
-        LENGTHS, np.exp(mean), np.sqrt(np.diag(covariance)), strict=True
-    ):
-        print(f"length {name}: {length:.0f} mm, spread {100 * relative:.1f}%", flush=True)
-    population = GaussianMixture(weights=np.ones(1), means=mean[None], factors=factor[None])
-    return usual[of_frame], population
+def face_ahead(poses_mm: Float) -> Float:
+    """Poses (n, 14, 3) turned about Y so that the left hip lies to +X of the right one."""
+    hips = poses_mm[:, L_HIP] - poses_mm[:, R_HIP]
+    level = np.hypot(hips[:, 0], hips[:, 2])
+    cosine, sine = hips[:, 0] / level, hips[:, 2] / level
+    turned = poses_mm.copy()
+    x, z = poses_mm[..., 0], poses_mm[..., 2]
+    turned[..., 0] = cosine[:, None] * x + sine[:, None] * z
+    turned[..., 2] = cosine[:, None] * z - sine[:, None] * x
+    return turned
 
 
 def main() -> None:
@@ -173,16 +102,15 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for the prior's two files")
     parser.add_argument("--name", default="cmu", help="the prior's name and file name")
     parser.add_argument("--exclude-subjects", default="", help="numbers, separated by commas")
-    parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     excluded = tuple(number for number in arguments.exclude_subjects.split(",") if number)
     command = "python -m library_store.fit_prior --mocap cmu.npz --out library_store/prior_data"
     if excluded:
-        command += f" --exclude-subjects {','.join(excluded)}"
+        command += f" --name {arguments.name} --exclude-subjects {','.join(excluded)}"
     card: dict[str, object] = {
         "name": arguments.name,
-        "version": "1",
-        "kind": "pose prior: Gaussian mixtures over body parts, orientation and limb proportions",
+        "version": "2",
+        "kind": "pose prior: recombined exemplars of captured poses, with composed parts",
         "licences": [
             {
                 "source": "CMU Graphics Lab Motion Capture Database, mocap.cs.cmu.edu",
@@ -197,11 +125,10 @@ def main() -> None:
         "command": command,
         "mocap_sha256": hashlib.sha256(arguments.mocap.read_bytes()).hexdigest(),
     }
-    mocap = read_mocap(arguments.mocap, excluded)
-    prior = fit_prior(mocap, PriorSettings(seed=arguments.seed), card)
+    prior = fit_prior(read_mocap(arguments.mocap, excluded), PriorSettings(), card)
     path = arguments.out / f"{arguments.name}.npz"
     save_prior(prior, path)
-    print(f"{path}: {path.stat().st_size / 1024:.0f} KiB")
+    print(f"{path}: {path.stat().st_size / 1024:.0f} KiB, {prior.card.notes['measured']}")
 
 
 if __name__ == "__main__":

@@ -26,9 +26,9 @@ TILE_PX = 220
 _RIGHT: Colour = (48, 128, 255)
 _LEFT: Colour = (255, 168, 64)
 _MIDDLE: Colour = (225, 225, 225)
-_BACKGROUND: Colour = (38, 34, 32)
+BACKGROUND: Colour = (38, 34, 32)
 _RULE: Colour = (60, 55, 52)
-_TEXT: Colour = (170, 166, 162)
+TEXT: Colour = (170, 166, 162)
 _BONES = (*LSP14.edges, (R_HIP, L_HIP))
 _CAPTION_PX = 34
 _SUBPIXEL_BITS = 4
@@ -38,14 +38,14 @@ def contact_sheet(library: Library, entries: Sequence[int], columns: int = 0) ->
     """A picture (H, W, 3) uint8 BGR of exemplars, ``columns`` a row (0: about square)."""
     columns = columns or max(1, math.ceil(math.sqrt(1.4 * len(entries))))
     rows = math.ceil(len(entries) / columns)
-    sheet = np.full((rows * TILE_PX, columns * TILE_PX, 3), _BACKGROUND, dtype=np.uint8)
+    sheet = np.full((rows * TILE_PX, columns * TILE_PX, 3), BACKGROUND, dtype=np.uint8)
     rotations, translations = library.cameras(entries)
     seen = np.einsum("nij,nkj->nki", rotations, library.poses_mm(entries))
     seen += translations[:, None]
     for number, (entry, pose) in enumerate(zip(entries, seen, strict=True)):
         top, left = TILE_PX * (number // columns), TILE_PX * (number % columns)
         tile = sheet[top : top + TILE_PX, left : left + TILE_PX]
-        _draw(tile, pose)
+        draw_pose(tile, pose)
         _caption(tile, library, entry)
     return sheet
 
@@ -58,7 +58,7 @@ def draw_entries(library: Library, n: int, kind: Kind | None = None, seed: int =
     return entries
 
 
-def _draw(tile: Image, pose_mm: Float) -> None:
+def draw_pose(tile: Image, pose_mm: Float) -> None:
     """The pose (14, 3), camera frame, in the middle of the tile above the caption."""
     flat = pose_mm[:, :2] / pose_mm[:, 2:]
     low, high = flat.min(axis=0), flat.max(axis=0)
@@ -84,7 +84,7 @@ def _caption(tile: Image, library: Library, entry: int) -> None:
     _, kind, name, frame, camera = library.exemplar_id(entry).split(":")
     for line, text in enumerate((f"{kind} {name}", f"{frame} : {camera}")):
         place = (6, TILE_PX - _CAPTION_PX + 12 + 14 * line)
-        cv2.putText(tile, text[:40], place, cv2.FONT_HERSHEY_SIMPLEX, 0.34, _TEXT, 1, cv2.LINE_AA)
+        cv2.putText(tile, text[:40], place, cv2.FONT_HERSHEY_SIMPLEX, 0.34, TEXT, 1, cv2.LINE_AA)
 
 
 def _fixed(point: Float) -> tuple[int, int]:

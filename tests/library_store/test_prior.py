@@ -11,11 +11,18 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from library_store.anatomy import LENGTHS, measure_lengths, root_of
 from library_store.errors import LibraryError
-from library_store.fit_prior import Mocap, PriorSettings, fit_prior, read_mocap
+from library_store.fit_prior import (
+    Mocap,
+    PriorSettings,
+    face_ahead,
+    fit_prior,
+    read_mocap,
+)
 from library_store.limits import measure
-from library_store.mixture_fit import FitSettings
-from library_store.prior import DEFAULT_PRIOR, PosePrior, save_prior
-from library_store.skeleton import LSP14, NECK
+from library_store.prior import DEFAULT_PRIOR, KINDS, Kind, PosePrior, save_prior
+from library_store.prior_sheet import prior_sheet
+from library_store.sheet import TILE_PX
+from library_store.skeleton import L_HIP, L_KNEE, LSP14, NECK, R_HIP, R_KNEE
 
 
 @pytest.fixture(scope="module")
@@ -37,19 +44,21 @@ def test_poses_are_whole_and_rooted(poses: np.ndarray) -> None:
 
 def test_people_have_human_proportions(poses: np.ndarray) -> None:
     lengths = dict(zip(LENGTHS, measure_lengths(poses).T, strict=True))
+    # Between the fifth and the last hundredth adults; below them children.
     expected_mm = {
         "trunk": (430, 650),
         "hips": (110, 260),
         "shoulder": (120, 260),
         "head": (190, 320),
-        "upper_arm": (230, 350),
+        "upper_arm": (220, 350),
         "forearm": (200, 350),
-        "thigh": (330, 490),
-        "shank": (350, 520),
+        "thigh": (320, 490),
+        "shank": (340, 530),
     }
     for name, (low, high) in expected_mm.items():
         inside = (lengths[name] > low) & (lengths[name] < high)
-        assert inside.mean() > 0.98, name
+        assert inside.mean() > 0.95, name
+        assert lengths[name].min() > 0.45 * low, name
     assert 0.85 < np.median(lengths["thigh"] / lengths["shank"]) < 1.05
 
 
@@ -64,13 +73,13 @@ def test_left_and_right_are_alike(poses: np.ndarray) -> None:
 def test_most_people_are_upright_and_some_lie(poses: np.ndarray) -> None:
     trunk = poses[:, NECK] / np.linalg.norm(poses[:, NECK], axis=1, keepdims=True)
     tilt = np.degrees(np.arccos(trunk[:, 1]))
-    assert np.mean(tilt < 45) > 0.7
+    assert np.mean(tilt < 45) > 0.6
     assert 0.04 < np.mean(np.abs(tilt - 90) < 30) < 0.25
-    assert np.mean(tilt > 120) < 0.05
+    assert 0.01 < np.mean(tilt > 120) < 0.08
 
 
 def test_the_prior_is_small_and_its_card_says_what_it_is(prior: PosePrior) -> None:
-    assert DEFAULT_PRIOR.stat().st_size < 500_000
+    assert DEFAULT_PRIOR.stat().st_size < 1_500_000
     assert "mocap.cs.cmu.edu" in prior.card.licences[0]["credit"]
     assert prior.card.notes["command"]
     assert prior.card.notes["measured"]
@@ -112,6 +121,54 @@ def test_limits_that_refuse_everything_do_not_hang(prior: PosePrior) -> None:
         nobody.sample(2, np.random.default_rng(0))
 
 
+def test_every_kind_is_drawn_as_often_as_composed(prior: PosePrior) -> None:
+    drawn = prior.draw(20_000, np.random.default_rng(2))
+    share = dict(zip(KINDS, np.bincount(drawn.kinds, minlength=len(KINDS)) / 20_000, strict=True))
+    made = prior.composition
+    kept_on = (1 - made.lying) * (1 - made.turned)
+    # Later kinds cover earlier ones, and the limits refuse some more than others.
+    assert share["turned"] == pytest.approx(made.turned, rel=0.2)
+    assert share["lying"] == pytest.approx(made.lying * (1 - made.turned), rel=0.2)
+    assert share["reaching"] == pytest.approx(made.reaching * kept_on, rel=0.4)
+    assert share["sitting"] == pytest.approx(made.sitting * kept_on, rel=0.4)
+    assert min(share["captured"], share["recombined"], share["limbs"]) > 0.15
+    assert sum(share.values()) == pytest.approx(1.0)
+
+
+def test_the_sitting_sit_and_the_lying_lie(prior: PosePrior) -> None:
+    drawn = prior.draw(20_000, np.random.default_rng(3))
+
+    def direction(kind: Kind, start: int, end: int) -> np.ndarray:
+        poses = drawn.poses[drawn.kinds == KINDS.index(kind)]
+        bone = poses[:, end] - (poses[:, start] if start >= 0 else 0.0)
+        pointing: np.ndarray = bone / np.linalg.norm(bone, axis=-1, keepdims=True)
+        return pointing
+
+    # Tilted ones aside, thighs are about level; of standing people they hang.
+    for hip, knee in ((R_HIP, R_KNEE), (L_HIP, L_KNEE)):
+        assert abs(np.median(direction("sitting", hip, knee)[:, 1])) < 0.25
+        assert np.median(direction("captured", hip, knee)[:, 1]) < -0.8
+    assert np.quantile(np.abs(direction("lying", -1, NECK)[:, 1]), 0.9) < 0.5
+
+
+def test_the_contact_sheet_has_a_row_of_people_a_kind(prior: PosePrior) -> None:
+    sheet = prior_sheet(prior, columns=3)
+    assert sheet.shape[1:] == (3 * TILE_PX, 3)
+    rows = np.array_split(sheet, len(KINDS))
+    assert all(len(np.unique(row.reshape(-1, 3), axis=0)) > 20 for row in rows)
+    with pytest.raises(ValueError, match="only 0 of 20,000 people turned"):
+        prior_sheet(replace(prior, composition=replace(prior.composition, turned=0.0)), columns=1)
+
+
+def test_facing_ahead_turns_about_the_vertical(poses: np.ndarray) -> None:
+    ahead = face_ahead(poses)
+    hips = ahead[:, L_HIP] - ahead[:, R_HIP]
+    assert np.all(hips[:, 0] > 0)
+    assert_allclose(hips[:, 2], 0.0, atol=1e-9)
+    assert_allclose(ahead[..., 1], poses[..., 1])
+    assert_allclose(measure(ahead), measure(poses), atol=1e-9)
+
+
 def test_a_prior_fitted_on_its_own_samples(poses: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "mocap.npz"
     subjects = np.array(["cmu_01", "cmu_02", "cmu_03", "cmu_35"])
@@ -120,13 +177,23 @@ def test_a_prior_fitted_on_its_own_samples(poses: np.ndarray, tmp_path: Path) ->
     assert len(read_mocap(path).poses_mm) == 1000
     mocap = read_mocap(path, exclude_subjects=("35",))
     assert set(mocap.subjects) == {"cmu_01", "cmu_02", "cmu_03"}
-    fit = FitSettings(n_components=12, n_iterations=5)
-    settings = PriorSettings(legs=fit, upper=fit)
+    settings = PriorSettings()
     fitted = fit_prior(mocap, settings, {"name": "tiny", "version": "1", "licences": []})
     again = fit_prior(
         Mocap(mocap.poses_mm, mocap.subjects), settings, {"name": "tiny", "version": "1"}
     )
-    assert_array_equal(fitted.legs.means, again.legs.means)
+    assert_array_equal(fitted.exemplars.legs, again.exemplars.legs)
     drawn = fitted.sample(500, np.random.default_rng(0))
     height = np.median(np.linalg.norm(poses[:, NECK], axis=1))
     assert np.median(np.linalg.norm(drawn[:, NECK], axis=1)) == pytest.approx(height, rel=0.05)
+    # One pose, seen a thousand times from all sides, is one exemplar.
+    turns = np.linspace(0.0, 6.0, 1000)
+    cosine, sine = np.cos(turns)[:, None], np.sin(turns)[:, None]
+    x, y, z = np.moveaxis(poses[:1].repeat(1000, axis=0), -1, 0)
+    round_and_round = np.stack([cosine * x + sine * z, y, cosine * z - sine * x], axis=-1)
+    one = fit_prior(
+        Mocap(round_and_round, mocap.subjects[:1].repeat(1000)),
+        settings,
+        {"name": "one", "version": "1", "licences": []},
+    )
+    assert len(one.exemplars.legs) == 1
