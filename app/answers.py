@@ -85,6 +85,24 @@ def model_of(engine: Engine) -> schemas.Model:
     return schemas.Model(name=card.name, version=card.version, sha256=card.sha256)
 
 
+def networks_of(engine: Engine) -> tuple[schemas.Network, ...]:
+    """The networks in service and what runs them."""
+    return tuple(
+        schemas.Network(
+            kind=network.card.output.kind,
+            name=network.card.name,
+            version=network.card.version,
+            sha256=network.card.sha256,
+            provider=network.runtime.provider,
+            precision=network.runtime.precision,
+            parameters=network.card.parameters,
+            gflop=round(network.card.gflop, 3),
+            input_px=network.card.output.side_px,
+        )
+        for network in (engine.estimator, engine.detector)
+    )
+
+
 def library_of(library: Library) -> schemas.LibraryRef:
     """The library served."""
     manifest = library.manifest

@@ -20,9 +20,12 @@ from library_store.library import Library
 from library_store.library import load as load_library
 from library_store.manifest import read_manifest
 from models import ModelCard, ModelError, PersonDetector, PoseEstimator
+from models.choice import choose
 
 Progress = Callable[[str, float], None]
 
+MAX_PEOPLE = 10
+"""Most people of one photo; their crops are one batch."""
 _WARM_UP_RUNS = 3
 
 
@@ -56,6 +59,15 @@ def locate_library(settings: Settings, progress: Progress | None = None) -> Path
         ) from error
 
 
+def chosen_networks(settings: Settings) -> tuple[str, str]:
+    """Names of the pose network's card and of the person network's. Raises ``ModelError``."""
+    where, provider = settings.weights_dir, settings.provider
+    pose = settings.model
+    if pose == "auto":
+        pose = choose(where, "pose", provider=provider, budget_ms=settings.model_budget_ms)
+    return pose, choose(where, "people", provider=provider)
+
+
 def load_engine(settings: Settings) -> Engine:
     """Load and warm up; blocking, a second or so.
 
@@ -63,8 +75,17 @@ def load_engine(settings: Settings) -> Engine:
     """
     cv2.setNumThreads(1)  # the workers are the parallelism
     try:
-        estimator = PoseEstimator(settings.model, weights_dir=settings.weights_dir)
-        detector = PersonDetector(weights_dir=settings.weights_dir)
+        pose, people = chosen_networks(settings)
+        where, provider = settings.weights_dir, settings.provider
+        side_by_side = settings.workers
+        estimator = PoseEstimator(
+            pose, weights_dir=where, provider=provider, concurrency=side_by_side
+        )
+        detector = PersonDetector(
+            people, weights_dir=where, provider=provider, concurrency=side_by_side
+        )
+        estimator.warm_up(MAX_PEOPLE)
+        detector.warm_up()
     except ModelError as error:
         raise StartupError(str(error)) from error
     library = _open_library(locate_library(settings), settings)

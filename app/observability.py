@@ -89,6 +89,9 @@ class Metrics:
             "posematch_upload_bytes", "Bytes of the bodies held in memory", registry=self.registry
         )
         self._build = Info("posematch", "What is being served", registry=self.registry)
+        self._networks = Info(
+            "posematch_model", "The networks in service", ["kind"], registry=self.registry
+        )
         ProcessCollector(registry=self.registry)
         PlatformCollector(registry=self.registry)
 
@@ -107,6 +110,10 @@ class Metrics:
     def describe(self, **labels: str) -> None:
         """State which version, model and library are served."""
         self._build.info(labels)
+
+    def describe_network(self, kind: str, **labels: str) -> None:
+        """State which network does what, and what runs it in which precision."""
+        self._networks.labels(kind).info(labels)
 
 
 def server_timing(timings_ms: Mapping[str, float]) -> str:

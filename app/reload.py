@@ -94,3 +94,11 @@ def describe(service: Service, engine: Engine) -> None:
         model=f"{engine.card.name} {engine.card.version}",
         library=f"{manifest.name} {manifest.version}",
     )
+    for network in (engine.estimator, engine.detector):
+        service.metrics.describe_network(
+            network.card.output.kind,
+            name=network.card.name,
+            version=network.card.version,
+            provider=network.runtime.provider,
+            precision=network.runtime.precision,
+        )

@@ -59,6 +59,20 @@ class Model(Answer):
     sha256: str
 
 
+class Network(Answer):
+    """A network in service: what it is, and what runs it in which precision."""
+
+    kind: Literal["pose", "people"]
+    name: str
+    version: str
+    sha256: str
+    provider: Literal["cpu", "cuda", "openvino"]
+    precision: Literal["fp32", "bf16", "int8"]
+    parameters: int
+    gflop: float
+    input_px: int
+
+
 class LibraryRef(Answer):
     """The exemplar library that was searched."""
 
@@ -347,6 +361,7 @@ class InfoAnswer(Answer):
     name: str
     version: str
     model: Model
+    networks: tuple[Network, ...]
     library: LibraryRef
     licences: tuple[Licence, ...]
     skeleton: Skeleton

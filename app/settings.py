@@ -12,6 +12,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from app import MAX_DECODABLE_PIXELS
 from app.errors import StartupError
+from models import ProviderChoice
 
 ENV_PREFIX = "POSEMATCH_"
 
@@ -117,7 +118,22 @@ class Settings(BaseSettings):
         Path(__file__).resolve().parent.parent / "models" / "weights",
         description="Directory of the networks' ONNX files and model cards.",
     )
-    model: str = Field("cpm", min_length=1, description="Name of the pose network to serve.")
+    model: str = Field(
+        "auto",
+        min_length=1,
+        description="Name of the pose network's card; auto takes the most accurate one that this "
+        "machine runs within POSEMATCH_MODEL_BUDGET_MS.",
+    )
+    model_budget_ms: float = Field(
+        12.0,
+        gt=0,
+        description="CPU time a person that POSEMATCH_MODEL=auto may spend, as the cards have it.",
+    )
+    provider: ProviderChoice = Field(
+        "auto",
+        description="What runs the networks: auto (the fastest one present), cpu, cuda or "
+        "openvino; one that is named but cannot work is refused.",
+    )
 
     api_keys: Annotated[tuple[SecretStr, ...], NoDecode] = Field(
         (),

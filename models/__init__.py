@@ -15,6 +15,7 @@ from models.errors import ModelError
 from models.heatmaps import Joints2D
 from models.person_detector import PersonBox, PersonDetector
 from models.pose_estimator import PoseEstimator
+from models.providers import ProviderChoice, Runtime
 
 __all__ = [
     "Joints2D",
@@ -23,4 +24,6 @@ __all__ = [
     "PersonBox",
     "PersonDetector",
     "PoseEstimator",
+    "ProviderChoice",
+    "Runtime",
 ]

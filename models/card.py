@@ -47,6 +47,11 @@ class PoseOutput(_Frozen):
     confidence: ConfidenceCalibration | None = None
     spread: SpreadCalibration | None = None
 
+    @property
+    def side_px(self) -> int:
+        """Longer side of what the network sees."""
+        return self.input_px
+
 
 class DetectorOutput(_Frozen):
     """How a person network is fed and read."""
@@ -56,6 +61,11 @@ class DetectorOutput(_Frozen):
     stride_px: int
     unit_px: float = Field(description="distances are logarithms of multiples of this")
     threshold: float = Field(description="least score of a person")
+
+    @property
+    def side_px(self) -> int:
+        """Longer side of what the network sees."""
+        return self.long_side_px
 
 
 Provider = Literal["cuda", "openvino", "cpu"]
@@ -81,6 +91,9 @@ class ModelCard(_Frozen):
     )
     parameters: int
     multiply_adds: int = Field(description="per input image or crop of the default size")
+    accuracy: float | None = Field(
+        None, description="what cards of a kind are compared by: PCK@0.2 on lspet_val, or recall"
+    )
     cost_ms: dict[str, float] = Field(
         default_factory=dict,
         description="CPU-ms an input, one thread, by 'provider/precision'; posematch model check",
@@ -102,9 +115,12 @@ def read_card(path: Path) -> ModelCard:
     try:
         return ModelCard.model_validate_json(path.read_bytes())
     except FileNotFoundError:
+        others = ", ".join(sorted(card.stem for card in path.parent.glob("*.json")))
         raise ModelError(
-            f"model card {path} is missing; restore it from the repository "
-            "or point POSEMATCH_WEIGHTS_DIR at a folder that has it"
+            f"model card {path} is missing"
+            + (f" (there are: {others})" if others else "")
+            + "; restore it from the repository, choose another model with POSEMATCH_MODEL "
+            "or point POSEMATCH_WEIGHTS_DIR at a directory that has it"
         ) from None
     except ValidationError as error:
         first = error.errors()[0]

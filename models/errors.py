@@ -3,3 +3,7 @@
 
 class ModelError(Exception):
     """A model or its card is missing, corrupt or of the wrong kind; names the file and the mend."""
+
+
+class AnnotationError(ModelError):
+    """A user's labelled images cannot be trained on; names the file, the record and the mend."""

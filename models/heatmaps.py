@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+Maps = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -31,21 +32,21 @@ class Joints2D:
     peak: Floats
 
 
-def marginals(maps: NDArray[np.float32], kind: str) -> Floats:
+def marginals(maps: NDArray[np.float32], kind: str) -> Maps:
     """Each joint's distribution over the cells (eq. 3), (N, J, h, w), summing to 1.
 
     ``logits`` are normalised by a softmax (odds of the beliefs), ``beliefs`` by their sum.
     """
-    flat = maps.reshape(*maps.shape[:2], -1).astype(np.float64)
+    flat = maps.reshape(*maps.shape[:2], -1)
     if kind == "logits":
         flat = np.exp(flat - flat.max(-1, keepdims=True))
     else:
-        flat = np.maximum(flat, 1e-12)
-    p: Floats = (flat / flat.sum(-1, keepdims=True)).reshape(maps.shape)
+        flat = np.maximum(flat, np.float32(1e-12))
+    p: Maps = (flat / flat.sum(-1, keepdims=True)).reshape(maps.shape)
     return p
 
 
-def sub_cell_peaks(p: Floats) -> tuple[Floats, NDArray[np.int64]]:
+def sub_cell_peaks(p: Maps) -> tuple[Floats, NDArray[np.int64]]:
     """Peak of each map as (x, y) in cells, (N, J, 2), and its cell's flat index (N, J).
 
     One Newton step on log p from the strongest cell, exact for a Gaussian (Zhang et al. 2020).
@@ -63,7 +64,7 @@ def sub_cell_peaks(p: Floats) -> tuple[Floats, NDArray[np.int64]]:
         cy[..., None, None] + steps[:, None],
         cx[..., None, None] + steps,
     ]
-    log_p = np.log(np.maximum(patch, 1e-30))
+    log_p = np.log(np.maximum(patch, 1e-30).astype(np.float64))
     gx = (log_p[..., 1, 2] - log_p[..., 1, 0]) / 2
     gy = (log_p[..., 2, 1] - log_p[..., 0, 1]) / 2
     xx = log_p[..., 1, 2] - 2 * log_p[..., 1, 1] + log_p[..., 1, 0]
@@ -74,24 +75,30 @@ def sub_cell_peaks(p: Floats) -> tuple[Floats, NDArray[np.int64]]:
     det = np.where(sound, det, 1.0)
     dx = np.where(sound, (xy * gy - yy * gx) / det, 0.0)
     dy = np.where(sound, (xy * gx - xx * gy) / det, 0.0)
-    dx = np.where(cx == x, np.clip(dx, -0.75, 0.75), 0.0)
-    dy = np.where(cy == y, np.clip(dy, -0.75, 0.75), 0.0)
+    # A narrow slanting peak can lie almost a cell from its strongest cell.
+    dx = np.where(cx == x, np.clip(dx, -1.0, 1.0), 0.0)
+    dy = np.where(cy == y, np.clip(dy, -1.0, 1.0), 0.0)
     return np.stack([x + dx, y + dy], -1), best
 
 
-def spread(p: Floats, at: Floats, target_sigma_cells: float) -> Floats:
+def spread(p: Maps, at: Floats, target_sigma_cells: float) -> Floats:
     """Second moment of each marginal about ``at`` (N, J, 2) in cells², (N, J, 2, 2).
 
     The networks learn labels blurred by a Gaussian, so its variance is taken off again; a floor of
     a tenth of a cell keeps the matrix invertible.
     """
     _, _, h, w = p.shape
-    dx = np.arange(w) - at[..., :1]
-    dy = np.arange(h) - at[..., 1:]
-    along_x, along_y = p.sum(-2), p.sum(-1)
-    xx = (along_x * dx**2).sum(-1)
-    yy = (along_y * dy**2).sum(-1)
-    xy = np.einsum("njhw,njh,njw->nj", p, dy, dx, optimize=True)
+    # All moments up to the second by two products, about the middle to keep their precision.
+    middle = np.array([w - 1, h - 1]) / 2
+    x, y = np.arange(w) - middle[0], np.arange(h) - middle[1]
+    powers_x = np.stack([np.ones(w), x, x * x], 1).astype(np.float32)
+    powers_y = np.stack([np.ones(h), y, y * y]).astype(np.float32)
+    moments = (powers_y @ (p @ powers_x)).astype(np.float64)
+    ax, ay = np.moveaxis(at - middle, -1, 0)
+    mass, mx, my = moments[..., 0, 0], moments[..., 0, 1], moments[..., 1, 0]
+    xx = moments[..., 0, 2] - 2 * ax * mx + ax * ax * mass
+    yy = moments[..., 2, 0] - 2 * ay * my + ay * ay * mass
+    xy = moments[..., 1, 1] - ax * my - ay * mx + ax * ay * mass
     covariance = np.stack([xx, xy, xy, yy], -1).reshape(*at.shape[:2], 2, 2)
     values, vectors = np.linalg.eigh(covariance)
     values = np.maximum(values - target_sigma_cells**2, 0.01)
@@ -109,7 +116,7 @@ def peak_beliefs(maps: NDArray[np.float32], best: NDArray[np.int64], kind: str) 
 
 
 def confidence_features(
-    peak: Floats, covariance_cells2: Floats, p: Floats, best: NDArray[np.int64], background: Floats
+    peak: Floats, covariance_cells2: Floats, p: Maps, best: NDArray[np.int64], background: Floats
 ) -> Floats:
     """What confidence is read from, (N, J, 5).
 
@@ -119,9 +126,9 @@ def confidence_features(
     """
     n, j, h, w = p.shape
     y, x = np.divmod(best, w)
-    near_x = np.abs(np.arange(w) - x[..., None]) <= 3
-    near_y = np.abs(np.arange(h) - y[..., None]) <= 3
-    mass = np.einsum("njhw,njh,njw->nj", p, near_y.astype(float), near_x.astype(float))
+    near_x = (np.abs(np.arange(w) - x[..., None]) <= 3).astype(np.float32)
+    near_y = (np.abs(np.arange(h) - y[..., None]) <= 3).astype(np.float32)
+    mass = (near_y[..., None, :] @ (p @ near_x[..., None]))[..., 0, 0].astype(np.float64)
     logit = np.log(np.clip(peak, 1e-4, 1 - 1e-4) / (1 - np.clip(peak, 1e-4, 1 - 1e-4)))
     area = np.log(np.trace(covariance_cells2, axis1=-2, axis2=-1) / (h * w) + 1e-6)
     behind = np.take_along_axis(background.reshape(n, 1, -1), best.reshape(n, 1, j), -1)[:, 0]

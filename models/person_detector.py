@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 
 from models.card import WEIGHTS_DIR, DetectorOutput, ModelCard
 from models.errors import ModelError
+from models.providers import ProviderChoice, Runtime
 from models.session import OnnxModel
 
 Floats = NDArray[np.float64]
+GRID_PX = 32
+"""Sides of the network's input are multiples of this: the pyramid halves five times."""
 MAX_OVERLAP = 0.5
 """Two boxes that overlap more (IoU) are one person."""
 
@@ -65,13 +68,35 @@ def decode(
     return boxes[kept], scores[kept]
 
 
+def shrunk(
+    image: NDArray[np.uint8], long_side_px: int
+) -> tuple[NDArray[np.uint8], tuple[int, int]]:
+    """The network's view of a photo: shrunk, in the corner of a canvas; the photo's size there."""
+    height, width = image.shape[:2]
+    scale = long_side_px / max(height, width)
+    small_w, small_h = max(1, round(width * scale)), max(1, round(height * scale))
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    rows, columns = (-(-side // GRID_PX) * GRID_PX for side in (small_h, small_w))
+    canvas = np.zeros((rows, columns, 3), np.uint8)
+    canvas[:small_h, :small_w] = cv2.resize(image, (small_w, small_h), interpolation=way)
+    return canvas, (small_w, small_h)
+
+
 class PersonDetector:
     """The person network with its card. Thread-safe."""
 
     def __init__(
-        self, name: str = "person", *, weights_dir: Path = WEIGHTS_DIR, threads: int = 1
+        self,
+        name: str = "person",
+        *,
+        weights_dir: Path = WEIGHTS_DIR,
+        provider: ProviderChoice = "auto",
+        threads: int = 1,
+        concurrency: int = 1,
     ) -> None:
-        self._model = OnnxModel(weights_dir, name, threads=threads)
+        self._model = OnnxModel(
+            weights_dir, name, provider=provider, threads=threads, concurrency=concurrency
+        )
         output = self._model.card.output
         if not isinstance(output, DetectorOutput):
             raise ModelError(f"model {name} is no person detector: its card says {output.kind}")
@@ -82,17 +107,25 @@ class PersonDetector:
         """The network's model card."""
         return self._model.card
 
+    @property
+    def runtime(self) -> Runtime:
+        """The provider in use and the precision it runs the network in."""
+        return self._model.runtime
+
+    def warm_up(self) -> None:
+        """Run every shape of photo there is: all but the CPU's provider compile each anew."""
+        if self.runtime.provider == "cpu":
+            return
+        long = -(-self._output.long_side_px // GRID_PX) * GRID_PX
+        for short in range(GRID_PX, long + 1, GRID_PX):
+            for height, width in {(short, long), (long, short)}:
+                self._model.run(np.zeros((1, height, width, 3), np.uint8))
+
     def detect(self, image: NDArray[np.uint8], max_people: int) -> list[PersonBox]:
         """People in a photo (H, W, 3) uint8 BGR, most certain first, at most ``max_people``."""
         height, width = image.shape[:2]
-        scale = self._output.long_side_px / max(height, width)
-        small_w, small_h = max(1, round(width * scale)), max(1, round(height * scale))
-        way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-        small = cv2.resize(image, (small_w, small_h), interpolation=way)
-        # The pyramid halves five times.
-        canvas = np.zeros((1, -(-small_h // 32) * 32, -(-small_w // 32) * 32, 3), np.uint8)
-        canvas[0, :small_h, :small_w] = small
-        maps = self._model.run(canvas)[0]
+        canvas, (small_w, small_h) = shrunk(image, self._output.long_side_px)
+        maps = self._model.run(canvas[None])[0]
         boxes, scores = decode(
             maps, self._output.stride_px, self._output.unit_px, self._output.threshold
         )

@@ -14,6 +14,7 @@ from models.crop import square_crop
 from models.errors import ModelError
 from models.heatmaps import Floats, Joints2D, calibrated, read_maps
 from models.person_detector import PersonBox
+from models.providers import ProviderChoice, Runtime
 from models.session import OnnxModel
 
 
@@ -21,9 +22,17 @@ class PoseEstimator:
     """The Convolutional Pose Machine with its card. Thread-safe."""
 
     def __init__(
-        self, name: str = "cpm", *, weights_dir: Path = WEIGHTS_DIR, threads: int = 1
+        self,
+        name: str = "cpm",
+        *,
+        weights_dir: Path = WEIGHTS_DIR,
+        provider: ProviderChoice = "auto",
+        threads: int = 1,
+        concurrency: int = 1,
     ) -> None:
-        self._model = OnnxModel(weights_dir, name, threads=threads)
+        self._model = OnnxModel(
+            weights_dir, name, provider=provider, threads=threads, concurrency=concurrency
+        )
         output = self._model.card.output
         if not isinstance(output, PoseOutput):
             raise ModelError(f"model {name} is no pose network: its card says {output.kind}")
@@ -37,9 +46,15 @@ class PoseEstimator:
         return self._model.card
 
     @property
-    def provider(self) -> str:
-        """The onnxruntime execution provider in use."""
-        return self._model.provider
+    def runtime(self) -> Runtime:
+        """The provider in use and the precision it runs the network in."""
+        return self._model.runtime
+
+    def warm_up(self, people: int) -> None:
+        """Run the batch sizes up to ``people``: all but the CPU's provider compile each anew."""
+        size = self._output.input_px
+        for count in range(people if self.runtime.provider == "cpu" else 1, people + 1):
+            self._model.run(np.zeros((count, size, size, 3), np.uint8))
 
     def estimate(self, image: NDArray[np.uint8], boxes: Sequence[PersonBox]) -> list[Joints2D]:
         """Joints of the person in each box of a photo (H, W, 3) uint8 BGR, one batch for all."""

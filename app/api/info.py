@@ -7,7 +7,7 @@ from typing import get_args
 from fastapi import APIRouter, Depends
 
 from app import schemas
-from app.answers import SKELETON, library_of, licence_of, model_of
+from app.answers import SKELETON, library_of, licence_of, model_of, networks_of
 from app.api.deps import EngineDep, ServiceDep, authorise
 from app.api.problems import describe
 from app.imaging import accepted_types
@@ -26,6 +26,7 @@ async def get_info(service: ServiceDep, engine: EngineDep) -> schemas.InfoAnswer
         name="posematch",
         version=VERSION,
         model=model_of(engine),
+        networks=networks_of(engine),
         library=library_of(engine.library),
         licences=tuple(licence_of(licence) for licence in engine.library.manifest.licences),
         skeleton=SKELETON,

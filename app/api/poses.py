@@ -23,7 +23,7 @@ from app.api.bodies import (
 )
 from app.api.deps import EngineDep, Service, ServiceDep, authorise
 from app.api.problems import describe, describe_ok, problem_of
-from app.engine import Engine
+from app.engine import MAX_PEOPLE, Engine
 from app.errors import (
     BodyTooLargeError,
     EmptyBodyError,
@@ -36,13 +36,12 @@ from app.pipeline import PhotoQuery
 
 router = APIRouter(tags=["poses"], dependencies=[Depends(authorise)])
 
-_MAX_PEOPLE = 10
 
 
 class PoseParameters(schemas.Given):
     """What to do with a photo."""
 
-    max_people: int = Field(5, ge=1, le=_MAX_PEOPLE, description="Most people to answer.")
+    max_people: int = Field(5, ge=1, le=MAX_PEOPLE, description="Most people to answer.")
     candidates: schemas.Candidates = Field(
         3, description="How many of the shortlist to return; never changes the answer."
     )

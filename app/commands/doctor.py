@@ -26,7 +26,7 @@ from rich.markup import escape
 from app.commands.bench import SAMPLE
 from app.commands.console import output
 from app.commands.machine import cpu_flags, describe_cpu, memory
-from app.engine import load_engine
+from app.engine import chosen_networks, load_engine
 from app.errors import StartupError
 from app.pipeline import PhotoQuery
 from app.settings import Settings, load_settings
@@ -95,7 +95,7 @@ def examine() -> Iterator[Finding]:
     yield _disk(settings)
     yield _port(settings)
     yield _exposure(settings)
-    weights = [_weights(settings.weights_dir, name) for name in (settings.model, "person")]
+    weights = list(_networks(settings))
     yield from weights
     library = _library(settings)
     yield library
@@ -233,6 +233,16 @@ def _exposure(settings: Settings) -> Finding:
         "everybody who reaches this address can use it",
         "set POSEMATCH_API_KEYS, or keep it behind something that checks",
     )
+
+
+def _networks(settings: Settings) -> Iterator[Finding]:
+    try:
+        names = chosen_networks(settings)
+    except ModelError as error:
+        yield Finding("networks", "failure", *_split(str(error)))
+        return
+    for name in names:
+        yield _weights(settings.weights_dir, name)
 
 
 def _weights(directory: Path, name: str) -> Finding:

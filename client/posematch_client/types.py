@@ -135,6 +135,7 @@ class InfoAnswer(TypedDict):
     methods: list[Literal["fusion", "paper"]]
     model: Model
     name: str
+    networks: list[Network]
     skeleton: Skeleton
     version: str
 
@@ -239,6 +240,20 @@ class Model(TypedDict):
     """The pose network that read the photo."""
 
     name: str
+    sha256: str
+    version: str
+
+
+class Network(TypedDict):
+    """A network in service: what it is, and what runs it in which precision."""
+
+    gflop: float
+    input_px: int
+    kind: Literal["pose", "people"]
+    name: str
+    parameters: int
+    precision: Literal["fp32", "bf16", "int8"]
+    provider: Literal["cpu", "cuda", "openvino"]
     sha256: str
     version: str
 

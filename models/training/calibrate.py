@@ -19,11 +19,12 @@ from library_store.skeleton import LIMB_JOINTS
 from models.card import (
     WEIGHTS_DIR,
     ConfidenceCalibration,
-    ModelCard,
     PoseOutput,
     SpreadCalibration,
     read_card,
+    write_card,
 )
+from models.cost import cpu_ms
 from models.heatmaps import Floats, calibrated, read_maps
 from models.pck import correct_keypoints
 from models.session import OnnxModel
@@ -34,6 +35,8 @@ from models.training.train import read_crops
 NEAR = 0.2
 """In torso lengths: what `confidence` is the probability of."""
 COVERAGE = 0.68
+RANKED_BY = "pck_0.2/lspet_val/14_joints"
+"""The measure that pose networks are compared by."""
 
 
 @dataclass(frozen=True)
@@ -196,6 +199,8 @@ def main() -> None:
     updated = card.model_copy(
         update={
             "measured": measured,
+            "accuracy": measured.get(RANKED_BY),
+            "cost_ms": card.cost_ms | {str(model.runtime): round(cpu_ms(model), 2)},
             "output": output.model_copy(
                 update={
                     "confidence": ConfidenceCalibration(
@@ -212,7 +217,7 @@ def main() -> None:
             ),
         }
     )
-    path.write_text(ModelCard.model_validate(updated).model_dump_json(indent=2) + "\n")
+    write_card(path, updated)
     if args.figure:
         draw_reliability(args.figure, stated, check, tuple(output.joint_names))
     outside = check.judged & ~check.labelled

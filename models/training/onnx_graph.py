@@ -26,6 +26,8 @@ OPSET = 17
 HALF = ".half"
 PREFIX = "network."
 INPUT, OUTPUT = "image", "maps"
+LAST = "last."
+"""Nodes whose names begin so make the last maps; an 8-bit twin keeps them in single precision."""
 Axes = tuple[str | int, ...]
 LANES = 16
 """CPU kernels work on blocks of so many channels; other counts fall back to slow ones."""
@@ -83,6 +85,7 @@ class GraphWriter:
         side: int = 0,
         stride: int = 0,
         pads: tuple[int, int, int, int] | None = None,
+        name: str = "",
     ) -> str:
         """A convolution as the module has it, but for what is given."""
         side = side or int(module.kernel_size[0])
@@ -100,6 +103,7 @@ class GraphWriter:
             kernel_shape=[side, side],
             strides=[stride, stride],
             pads=list(pads or (around, around, end, end)),
+            name=name,
         )
 
     def norm(self, x: str, module: nn.BatchNorm2d) -> str:
@@ -129,13 +133,20 @@ class GraphWriter:
             x = self.residual(x, module)
         return x
 
-    def up2(self, x: str, mode: str = "nearest") -> str:
+    def up2(self, x: str, mode: str = "nearest", name: str = "") -> str:
         """Twice the size."""
         scales = self.constant(np.array([1, 1, 2, 2], np.float32))
         grid = "asymmetric" if mode == "nearest" else "half_pixel"
         extra = {"nearest_mode": "floor"} if mode == "nearest" else {}
         return self.node(
-            "Resize", x, "", scales, mode=mode, coordinate_transformation_mode=grid, **extra
+            "Resize",
+            x,
+            "",
+            scales,
+            mode=mode,
+            coordinate_transformation_mode=grid,
+            name=name,
+            **extra,
         )
 
     def stem(self, image: str, module: nn.Sequential) -> str:
@@ -233,8 +244,10 @@ def pose_model(network: ConvolutionalPoseMachine, size_px: int) -> onnx.ModelPro
             beliefs = _beliefs(w, hidden, stage.score)
     fine = w.node("Add", x4, w.up2(w.conv_norm(hidden, network.fine_low)))
     fine = w.residual(w.node("Relu", fine), network.fine)
-    coarse = w.up2(w.conv(hidden, network.stages[-1].score), "linear")
-    result = w.node("Add", w.conv(fine, network.fine_score), coarse)
+    coarse = w.conv(hidden, network.stages[-1].score, name=LAST + "coarse")
+    coarse = w.up2(coarse, "linear", name=LAST + "raised")
+    fine = w.conv(fine, network.fine_score, name=LAST + "fine")
+    result = w.node("Add", fine, coarse, name=LAST + "sum")
     side = size_px // 4
     return w.model(
         result, ("n", size_px, size_px, 3), ("n", network.fine_score.out_channels, side, side)
@@ -251,5 +264,7 @@ def person_model(network: PersonNetwork) -> onnx.ModelProto:
     up = w.up2(w.conv_norm(y16, network.t16))
     y8 = w.residual(w.node("Relu", w.node("Add", x8, up)), network.m8)
     return w.model(
-        w.conv(y8, network.score), ("n", "h", "w", 3), ("n", network.score.out_channels, "h8", "w8")
+        w.conv(y8, network.score, name=LAST + "score"),
+        ("n", "h", "w", 3),
+        ("n", network.score.out_channels, "h8", "w8"),
     )

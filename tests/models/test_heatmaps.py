@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from models.heatmaps import calibrated, marginals, peak_beliefs, spread, sub_cell_peaks
@@ -25,6 +25,7 @@ def gaussian(x: float, y: float, sigma_x: float, sigma_y: float, rho: float = 0.
     ratio=st.floats(0.6, 1.6),
     rho=st.floats(-0.5, 0.5),
 )
+@example(x=2.1875, y=2.5625, sigma=1.0, ratio=0.625, rho=0.5)
 def test_peak_of_a_gaussian_is_found_to_a_tenth_of_an_input_pixel(
     x: float, y: float, sigma: float, ratio: float, rho: float
 ) -> None:

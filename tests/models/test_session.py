@@ -1,13 +1,20 @@
+"""What is loaded is what its card says, by the provider that was asked for; all else is refused."""
+
 import json
+import logging
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import onnxruntime as ort
 import pytest
 
 from models import ModelError, PersonDetector, PoseEstimator
 from models.card import WEIGHTS_DIR
 from models.session import OnnxModel
+from tests.models import tiny_onnx
+from tests.models.tiny_onnx import node, planes
 
 
 @pytest.fixture
@@ -17,9 +24,11 @@ def weights(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_missing_card_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match=r"cpm\.json is missing"):
-        PoseEstimator(weights_dir=tmp_path)
+def test_missing_card_is_named_and_the_others_are_offered(tmp_path: Path, weights: Path) -> None:
+    with pytest.raises(ModelError, match=r"cpm\.json is missing; restore"):
+        PoseEstimator(weights_dir=tmp_path / "none")
+    with pytest.raises(ModelError, match=r"cpn\.json is missing \(there are: cpm, .*person"):
+        PoseEstimator("cpn", weights_dir=weights)
 
 
 def test_missing_weights_are_named(weights: Path) -> None:
@@ -40,15 +49,10 @@ def test_corrupt_weights_are_refused(weights: Path, damage: str) -> None:
         PoseEstimator(weights_dir=weights)
 
 
-def test_a_file_that_is_no_onnx_is_refused(weights: Path) -> None:
-    import hashlib
-
-    (weights / "cpm.onnx").write_bytes(b"not a network")
-    card = json.loads((weights / "cpm.json").read_text())
-    card["sha256"] = hashlib.sha256(b"not a network").hexdigest()
-    (weights / "cpm.json").write_text(json.dumps(card))
-    with pytest.raises(ModelError, match="no usable ONNX model"):
-        OnnxModel(weights, "cpm")
+def test_another_networks_weights_under_a_card_are_refused(weights: Path) -> None:
+    shutil.copy(weights / "person.onnx", weights / "cpm.onnx")
+    with pytest.raises(ModelError, match="belongs to another version"):
+        PoseEstimator(weights_dir=weights)
 
 
 def test_a_card_with_a_wrong_value_names_the_field(weights: Path) -> None:
@@ -66,10 +70,87 @@ def test_a_detector_is_no_pose_network_and_the_other_way_round() -> None:
         PersonDetector("cpm")
 
 
-def test_a_batch_gives_what_its_images_give_alone() -> None:
-    model = OnnxModel(WEIGHTS_DIR, "cpm")
+def test_a_network_as_its_card_has_it_is_taken(tmp_path: Path) -> None:
+    tiny_onnx.write(tmp_path, "tiny", tiny_onnx.model(planes()))
+    image = np.random.default_rng(0).integers(0, 256, (3, 32, 32, 3)).astype(np.uint8)
+    maps = OnnxModel(tmp_path, "tiny").run(image)
+    np.testing.assert_array_equal(maps, image.transpose(0, 3, 1, 2))
+
+
+SOUND = tiny_onnx.model(planes())
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"not a network", "no ONNX model that onnxruntime"),
+        (SOUND[: len(SOUND) // 2], "no ONNX model that onnxruntime"),
+        (tiny_onnx.model(planes(), opset=99), "opset"),
+        (
+            tiny_onnx.model(planes(node("Frobnicate", ["planes"], "odd"), last="odd")),
+            "Frobnicate",
+        ),
+        (tiny_onnx.model(planes(), kind=tiny_onnx.FLOAT), "expected one uint8 image input"),
+        (tiny_onnx.model(planes(), image=(1, 32, 32, 3)), "batch size must be free"),
+        (tiny_onnx.model(planes(), image=("n", 64, 64, 3)), "as the card has it, are refused"),
+        (
+            tiny_onnx.model(
+                planes(node("Concat", ["planes", "planes"], "six", axis=1), last="six")
+            ),
+            r"maps of shape \(6, 32, 32\) instead of \(3, 32, 32\)",
+        ),
+        (
+            tiny_onnx.model(planes(node("Div", ["planes", "planes"], "ratio"), last="ratio")),
+            "not finite",
+        ),
+    ],
+    ids=["text", "cut", "opset", "operator", "floats", "one", "size", "maps", "nan"],
+)
+def test_foreign_networks_are_refused_with_a_reason_and_a_mend(
+    tmp_path: Path, data: bytes, said: str
+) -> None:
+    tiny_onnx.write(tmp_path, "tiny", data)
+    with pytest.raises(ModelError, match=said) as refusal:
+        OnnxModel(tmp_path, "tiny")
+    assert str(tmp_path / "tiny.onnx") in str(refusal.value)
+    assert "posematch model export" in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", ["cpm", "cpm-int8"])
+def test_a_batch_gives_what_its_images_give_alone(name: str) -> None:
+    model = OnnxModel(WEIGHTS_DIR, name)
     size = model.card.output.model_dump()["input_px"]
     images = np.random.default_rng(0).integers(0, 256, (3, size, size, 3)).astype(np.uint8)
     together = model.run(images)
     for i in range(3):
         np.testing.assert_allclose(model.run(images[i : i + 1])[0], together[i], atol=1e-3)
+
+
+def test_a_provider_that_is_not_installed_is_refused() -> None:
+    with pytest.raises(ModelError, match="has only cpu; install onnxruntime-gpu"):
+        OnnxModel(WEIGHTS_DIR, "cpm", provider="cuda")
+
+
+def test_a_provider_that_fails_is_refused_when_asked_for_and_replaced_by_auto(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """onnxruntime claims CUDA as its GPU build does where there is no driver: the session falls
+    back to the CPU without an error."""
+    tiny_onnx.write(tmp_path, "tiny", SOUND)
+    real: Any = ort.InferenceSession
+
+    def falls_back(data: bytes, options: ort.SessionOptions, providers: list[Any]) -> Any:
+        del providers
+        options.add_session_config_entry("session.disable_cpu_ep_fallback", "0")
+        return real(data, options, providers=["CPUExecutionProvider"])
+
+    monkeypatch.setattr(ort, "InferenceSession", falls_back)
+    monkeypatch.setattr(
+        ort, "get_available_providers", lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"]
+    )
+    with pytest.raises(ModelError, match="POSEMATCH_PROVIDER=cuda: cuda cannot run model tiny"):
+        OnnxModel(tmp_path, "tiny", provider="cuda")
+    with caplog.at_level(logging.WARNING):
+        model = OnnxModel(tmp_path, "tiny", provider="auto")
+    assert str(model.runtime) == "cpu/fp32"
+    assert "cuda cannot run" in caplog.text

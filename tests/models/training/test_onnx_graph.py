@@ -1,6 +1,7 @@
 """The exported graphs compute what the modules do; needs the train extra."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
@@ -19,7 +20,7 @@ from models.training.network import (  # noqa: E402
 from models.training.onnx_graph import person_model, pose_model  # noqa: E402
 
 
-def shaken(network: "torch.nn.Module") -> "torch.nn.Module":
+def shaken(network: Any) -> Any:
     """Every parameter and statistic away from where it starts, so that none can be forgotten.
 
     Values are those that half precision has: the files store them so.
@@ -38,7 +39,7 @@ def shaken(network: "torch.nn.Module") -> "torch.nn.Module":
 CPM = CpmConfig(width=16, blocks=(1, 2, 1, 1), stage_width=16, n_stages=2)
 
 
-def outputs(path: Path, network: "torch.nn.Module", images: np.ndarray) -> tuple[np.ndarray, ...]:
+def outputs(path: Path, network: Any, images: np.ndarray) -> tuple[np.ndarray, ...]:
     session = ort.InferenceSession(str(path), providers=["CPUExecutionProvider"])
     with torch.no_grad():
         out = network(torch.from_numpy(images).permute(0, 3, 1, 2).float() / 127.5 - 1)

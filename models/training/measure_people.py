@@ -1,0 +1,82 @@
+"""Measure a person network through its ONNX file, into its card.
+
+``python -m models.training.measure_people --scenes SCENES --scenes-labels FILE [--name person]``
+on the scenes that training held out, against the teacher's boxes (label_scenes.py).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from models.card import WEIGHTS_DIR, read_card, write_card
+from models.cost import cpu_ms
+from models.person_detector import PersonDetector, iou
+from models.session import OnnxModel
+from models.training.dataset import Image, decode_members
+from models.training.train_people import DEV_ONE_IN
+
+SURE = 0.7
+"""Teacher's score from which a box has to be found."""
+SAME, STRANGE = 0.5, 0.3
+"""Overlap from which a box is the teacher's, and up to which it is none of the teacher's."""
+
+
+def recall_and_extra(
+    detector: PersonDetector, scenes: list[tuple[Image, np.ndarray]]
+) -> tuple[float, float]:
+    """Share of the sure teacher boxes (x0, y0, x1, y1, score) found; strange boxes a scene."""
+    found = wanted = extra = 0
+    for image, people in scenes:
+        boxes = np.array(
+            [
+                (b.x_px, b.y_px, b.x_px + b.width_px, b.y_px + b.height_px)
+                for b in detector.detect(image, 100)
+            ]
+        ).reshape(-1, 4)
+        sure = people[people[:, 4] >= SURE, :4]
+        found += int((iou(boxes, sure).max(0, initial=0) > SAME).sum())
+        wanted += len(sure)
+        extra += int((iou(boxes, people[:, :4]).max(1, initial=0) < STRANGE).sum())
+    return found / wanted, extra / len(scenes)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", type=Path, required=True, help="tar or folder")
+    parser.add_argument("--scenes-labels", type=Path, required=True)
+    parser.add_argument("--weights", type=Path, default=WEIGHTS_DIR)
+    parser.add_argument("--name", default="person")
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+
+    images = decode_members(args.scenes)
+    records = json.loads(args.scenes_labels.read_text())[::DEV_ONE_IN]
+    scenes = [
+        (images[r["image"]], np.array(r["people"], np.float64).reshape(-1, 5)) for r in records
+    ]
+    detector = PersonDetector(args.name, weights_dir=args.weights)
+    recall, extra = recall_and_extra(detector, scenes)
+    path = args.weights / f"{args.name}.json"
+    card = read_card(path)
+    kept = {k: v for k, v in card.measured.items() if k == "training_steps"}
+    measured = {
+        **kept,
+        f"recall_of_sure_teacher_boxes/{len(scenes)}_held_out_scenes": round(recall, 4),
+        "boxes_beside_the_teacher's/scene": round(extra, 2),
+        "command": "python -m models.training.measure_people --scenes SCENES --scenes-labels FILE",
+    }
+    model = OnnxModel(args.weights, args.name)
+    cost_ms = card.cost_ms | {str(model.runtime): round(cpu_ms(model), 2)}
+    update = {"measured": measured, "accuracy": round(recall, 4), "cost_ms": cost_ms}
+    write_card(path, card.model_copy(update=update))
+    print(measured | cost_ms)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,211 @@
+"""A user's own labelled images: a COCO keypoints file and the folder its images lie in.
+
+Keypoints are taken by their names in ``categories[*].keypoints``: shoulders, elbows, wrists, hips,
+knees and ankles with ``left_``/``right_`` (or ``l_``/``r_``) before them, and ``neck`` and
+``head_top`` where there are any; others (eyes, ears, toes) are left out. Visibility is COCO's:
+0 not labelled, 1 labelled but hidden, 2 seen. Pixels are those of the stored file, whatever its
+EXIF orientation says.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field, ValidationError
+
+from library_store.skeleton import LSP14
+from models.crop import square_crop
+from models.errors import AnnotationError
+from models.training.dataset import Image, LabelledCrop
+
+KEPT_SCALE = 1.6
+"""Side of the square kept around a person over the joints' extent: room for random views."""
+KEPT_PX = 256
+LEAST_JOINTS = 6
+_HEAD = {"head_top": "head_top", "top_head": "head_top", "headtop": "head_top", "neck": "neck"}
+_LIMB = re.compile(r"(l|left|r|right)_?(shoulder|elbow|wrist|hip|knee|ankle)")
+
+
+class _Image(BaseModel):
+    id: int
+    file_name: str
+    width: int | None = None
+    height: int | None = None
+
+
+class _Annotation(BaseModel):
+    id: int | None = None
+    image_id: int
+    category_id: int
+    keypoints: list[Annotated[float, Field(allow_inf_nan=False)]] = []
+    iscrowd: int = 0
+
+
+class _Category(BaseModel):
+    id: int
+    keypoints: list[str] = []
+
+
+class _Coco(BaseModel):
+    images: list[_Image]
+    annotations: list[_Annotation]
+    categories: list[_Category]
+
+
+def read_coco(annotations: Path, images: Path) -> list[LabelledCrop]:
+    """Every person with at least six labelled joints, grouped by image.
+
+    Raises ``AnnotationError`` at the first thing that makes the labels doubtful: a record that is
+    not COCO's, an image that is missing or of another size, coordinates that cannot be pixels.
+    """
+    coco = _parse(annotations)
+    columns = {c.id: _columns(annotations, c) for c in coco.categories if c.keypoints}
+    if not columns:
+        raise AnnotationError(
+            f"{annotations}: no category has keypoints; is it a file of boxes only? "
+            "person_keypoints_*.json is wanted"
+        )
+    files = {image.id: image for image in coco.images}
+    people: dict[int, list[tuple[str, NDArray[np.float64]]]] = {}
+    for index, record in enumerate(coco.annotations):
+        name = f"annotation {index if record.id is None else record.id}"
+        if record.iscrowd or record.category_id not in columns or not any(record.keypoints):
+            continue
+        if record.image_id not in files:
+            raise AnnotationError(
+                f"{annotations}: {name} is of image {record.image_id}, which is not among images"
+            )
+        points = _points(annotations, name, record, columns[record.category_id])
+        if (points[:, 2] > 0).sum() >= LEAST_JOINTS:
+            people.setdefault(record.image_id, []).append((name, points))
+    if not people:
+        raise AnnotationError(
+            f"{annotations}: nobody has {LEAST_JOINTS} labelled joints or more; nothing to learn"
+        )
+    crops = []
+    for image_id, persons in sorted(people.items()):
+        pixels = _read_image(annotations, images, files[image_id])
+        for name, points in persons:
+            _check_points(annotations, name, points, pixels)
+            crops.append(cut_out(f"{files[image_id].file_name}/{name}", image_id, pixels, points))
+    return crops
+
+
+def cut_out(
+    name: str, group: int, pixels: Image, points: NDArray[np.float64], *, wild: bool = False
+) -> LabelledCrop:
+    """The square around a person, at most KEPT_PX wide; ``points`` (14, 3) x, y, visibility."""
+    known = points[:, 2] > 0
+    low, high = points[known, :2].min(0), points[known, :2].max(0)
+    center, extent = (low + high) / 2, max(float((high - low).max()), 1.0)
+    side = KEPT_SCALE * extent
+    size = max(8, min(KEPT_PX, round(side)))
+    crop, scale, origin = square_crop(pixels, (float(center[0]), float(center[1])), side, size)
+    joints = (points[:, :2] - np.array(origin)) / scale
+    return LabelledCrop(
+        name=name,
+        group=group,
+        image=crop,
+        joints_px=np.where(known[:, None], joints, 0).astype(np.float32),
+        weight=known.astype(np.float32),
+        visible=(points[:, 2] > 1).astype(np.float32),
+        wild=wild,
+    )
+
+
+def _parse(path: Path) -> _Coco:
+    try:
+        return _Coco.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        raise AnnotationError(f"{path}: there is no such file") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "the file"
+        raise AnnotationError(
+            f"{path} is no COCO keypoints file: {where}: {first['msg']}; wanted are images, "
+            "annotations and categories as on cocodataset.org/#format-data"
+        ) from None
+
+
+def _columns(path: Path, category: _Category) -> dict[int, int]:
+    """Which keypoint of a category is which lsp14 joint."""
+    columns: dict[int, int] = {}
+    for column, raw in enumerate(category.keypoints):
+        name = re.sub(r"[\s\-]+", "_", raw.strip().lower())
+        limb = _LIMB.fullmatch(name)
+        joint = f"{limb[1][0]}_{limb[2]}" if limb else _HEAD.get(name)
+        if joint is not None:
+            columns[column] = LSP14.joint_names.index(joint)
+    limbs = {LSP14.joint_names[j] for j in columns.values()} - {"head_top", "neck"}
+    missing = sorted(set(LSP14.joint_names[2:]) - limbs)
+    if missing:
+        raise AnnotationError(
+            f"{path}: category {category.id} lacks the keypoints {', '.join(missing)}; it has "
+            f"{', '.join(category.keypoints)}. Rename them like left_shoulder"
+        )
+    return columns
+
+
+def _points(
+    path: Path, name: str, record: _Annotation, columns: dict[int, int]
+) -> NDArray[np.float64]:
+    """(14, 3): x, y, visibility."""
+    values = np.array(record.keypoints, np.float64)
+    if len(values) % 3 or len(values) // 3 <= max(columns):
+        raise AnnotationError(
+            f"{path}: {name} has {len(values)} numbers in keypoints, wanted are x, y, visibility "
+            "for each keypoint of its category"
+        )
+    triples = values.reshape(-1, 3)
+    if not np.isin(triples[:, 2], (0, 1, 2)).all():
+        raise AnnotationError(
+            f"{path}: {name} has a visibility that is not 0, 1 or 2: keypoints are x, y, "
+            "visibility; confidences have to be made into labels first"
+        )
+    points = np.zeros((LSP14.n_joints, 3))
+    for column, joint in columns.items():
+        points[joint] = triples[column]
+    return points
+
+
+def _read_image(annotations: Path, folder: Path, record: _Image) -> Image:
+    path = folder / record.file_name
+    if not path.is_file():
+        raise AnnotationError(
+            f"{annotations}: image {record.id} is {path}, which does not exist; "
+            "is this the folder that file_name is relative to?"
+        )
+    pixels = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None:
+        raise AnnotationError(f"{path} is no image that can be decoded")
+    height, width = pixels.shape[:2]
+    if record.width is not None and (record.width, record.height) != (width, height):
+        raise AnnotationError(
+            f"{path} is {width}x{height} px, but {annotations} labelled an image of "
+            f"{record.width}x{record.height}: it was resized or turned since"
+        )
+    return np.asarray(pixels, np.uint8)
+
+
+def _check_points(path: Path, name: str, points: NDArray[np.float64], pixels: Image) -> None:
+    known = points[points[:, 2] > 0, :2]
+    height, width = pixels.shape[:2]
+    if (known <= 1).all():
+        raise AnnotationError(
+            f"{path}: all keypoints of {name} lie within 0..1: they look divided by the image's "
+            "size; COCO has pixels"
+        )
+    slack = 0.1 * max(height, width)
+    if (known < -slack).any() or (known > (width + slack, height + slack)).any():
+        x, y = known[np.argmax(np.abs(known - (width / 2, height / 2)).max(1))]
+        raise AnnotationError(
+            f"{path}: {name} has a keypoint at ({x:g}, {y:g}), far outside its image of "
+            f"{width}x{height} px"
+        )
+    if np.ptp(known, axis=0).max() < 4:
+        raise AnnotationError(f"{path}: the keypoints of {name} all lie on one spot")
