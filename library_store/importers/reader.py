@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
+import numpy as np
+
 from library_store.importers import asf_amc, bvh, c3d, h36m, npz
 from library_store.importers.clip import Clip, MocapError
 
@@ -28,7 +30,9 @@ def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
     if importer is None:
         raise MocapError(path, f"not a kind of file that can be imported: {', '.join(SUFFIXES)}")
     try:
-        return importer()
+        # Damaged numbers overflow to infinity; the checks then drop their frames.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return importer()
     except OSError as error:
         raise MocapError(path, f"cannot be read: {error.strerror}") from error
 

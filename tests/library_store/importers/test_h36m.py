@@ -158,6 +158,16 @@ def test_other_files_of_the_release_are_refused(folder: Path) -> None:
         read(write_cdf(folder / "D3_Positions" / "A.cdf", standing(), variable="Angles"))
 
 
+def test_numbers_beyond_all_bounds_are_dropped_frames(folder: Path) -> None:
+    poses = in_world(standing())
+    poses[7] = 1e200
+    poses[9, 3, 2] = np.nan
+    (clip,) = read(write_cdf(folder / "D3_Positions" / "A.cdf", poses))
+    assert "2 frames with missing joints dropped" in clip.findings
+    assert 7 not in clip.frames
+    assert 9 not in clip.frames
+
+
 @pytest.mark.parametrize("keep", [0, 10, 400, 3_000])
 def test_cut_files_are_refused(folder: Path, keep: int) -> None:
     path = write_cdf(folder / "D3_Positions" / "A.cdf", in_world(standing()))
