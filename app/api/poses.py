@@ -37,7 +37,6 @@ from app.pipeline import PhotoQuery
 router = APIRouter(tags=["poses"], dependencies=[Depends(authorise)])
 
 
-
 class PoseParameters(schemas.Given):
     """What to do with a photo."""
 
