@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from library_store.anatomy import Float
+from library_store.anatomy import Float, measure_lengths
 from library_store.importers.rotation import euler
 from library_store.prior import PosePrior
+from library_store.proportions import resize
 
 _ARM, _ARM_R = "180 -30 -90", "180 30 90"
 _BONES = (
@@ -219,10 +220,14 @@ def nested(path: Path, value: Any) -> Path:
     return path
 
 
+ADULT_MM = np.array([520.0, 180.0, 180.0, 245.0, 290.0, 260.0, 410.0, 420.0])
+"""Lengths of a person of whom no check has any doubt, in the order of ``anatomy.LENGTHS``."""
+
+
 def people(n: int = 40, seed: int = 5) -> Float:
     """Poses (n, 14, 3) of one person in mm, Y up, moving smoothly."""
-    prior = PosePrior.load()
-    pose = prior.sample(1, np.random.default_rng(seed))[0]
+    drawn = PosePrior.load().sample(1, np.random.default_rng(seed))
+    pose = resize(drawn, ADULT_MM / measure_lengths(drawn))[0]
     angles = np.zeros((n, 3))
     angles[:, 1] = np.linspace(0.0, 60.0, n)
     turned: Float = pose @ euler("zyx", angles).transpose(0, 2, 1)
