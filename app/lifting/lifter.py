@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from app.lifting.calibration import FUSION_SIGMA, SigmaCalibration
-from app.lifting.fusion import FusedPose, FusionSettings, fuse, place_ensemble
+from app.lifting.ensemble import place_ensemble
+from app.lifting.fusion import FusedPose, FusionSettings, fuse
 from app.lifting.geometry import CentredView, Floats, Integers, Mask, centre_view, project
 from app.lifting.posterior import shortlist_probabilities, standard_px_per_unit
 from app.lifting.resection import Cameras, resect
@@ -228,7 +229,13 @@ class Lifter:
 
     def _fuse(self, view: CentredView, confidence: Floats, neighbours: _Neighbours) -> FusedPose:
         weights = (confidence > 0).astype(np.float64)
-        ensemble = place_ensemble(neighbours.poses_mm, neighbours.rotations, view.points, weights)
+        ensemble = place_ensemble(
+            neighbours.poses_mm,
+            neighbours.rotations,
+            view.points,
+            weights,
+            self._settings.fusion.proportion_spread,
+        )
         covariance = view.covariance
         if covariance is not None:
             covariance = covariance * ensemble.px_per_unit**2

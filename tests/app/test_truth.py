@@ -80,7 +80,10 @@ def test_where_the_person_stands(found: list[tuple[Render, dict[str, Any]]]) -> 
 
 
 def test_answer_projects_onto_the_joints(found: list[tuple[Render, dict[str, Any]]]) -> None:
+    """All joints do, but for those set aside as contradicting the rest (two at the most)."""
     for render, person in found:
         points = np.array([[j["x_mm"], j["y_mm"], j["z_mm"]] for j in person["joints_3d"]])
         residual = np.linalg.norm(project(points, person["camera"]) - joints_px(person), axis=1)
-        assert np.median(residual) < 0.06 * np.ptp(render.joints_px[:, 1])
+        if "inconsistent_joints" in person["warnings"]:
+            residual = np.sort(residual)[:-2]
+        assert residual.mean() < 0.06 * np.ptp(render.joints_px[:, 1])

@@ -90,7 +90,7 @@ def test_fusion_beats_the_paper(lifter: Lifter, people: People) -> None:
             for i in range(len(people.joints_px))
         ]
         errors[method] = rigid_error_mm(np.stack(lifted), people.joints_mm).mean()
-    assert errors["fusion"] < 0.95 * errors["paper"]  # of a small library; see docs/accuracy.md
+    assert errors["fusion"] < 0.9 * errors["paper"]
 
 
 @pytest.mark.parametrize("method", METHODS)

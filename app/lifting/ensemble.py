@@ -1,0 +1,164 @@
+"""The local prior: what poses that look about like this one are, as one Gaussian.
+
+The nearest exemplars, each moved in front of the camera, are an *ensemble*. Their weighted mean and
+covariance, plus what body proportions that the library does not have would do, make a Gaussian over
+the *state* of a person: the image positions of all joints in *standard pixels*
+(``app.lifting.posterior``), x and y of the first joint first, and after them the depths of all
+joints relative to the root's, ``z / z_root - 1``.
+
+Covariances between joints fade with the number of bones between them (*localisation*): those of far
+joints are mostly sampling error of a small ensemble. Neighbours are weighed by their distance in
+the image, apart from what other proportions explain of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from app.lifting.geometry import Floats, Integers
+from app.lifting.posterior import STANDARD_PX_PER_MM
+from app.lifting.proportions import proportion_directions
+from app.lifting.resection import initial_translation
+from library_store.skeleton import L_HIP, LSP14, R_HIP, Skeleton
+
+_TYPICAL = 16
+"""Neighbours whose mean shows what proportions do: they need not be told apart for that."""
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """Neighbours in front of the camera.
+
+    ``states`` (K, 3 J), see the module; ``root_depth_mm`` (K,); ``proportions`` (D, 3 J): what a
+    typical deviation of the body's proportions adds to a state, one independent direction a row;
+    ``px_per_unit``: standard pixels in a normalised unit.
+    """
+
+    states: Floats
+    root_depth_mm: Floats
+    proportions: Floats
+    px_per_unit: float
+
+
+@dataclass(frozen=True)
+class LocalPrior:
+    """A Gaussian over states: ``mean`` (3 J,), ``covariance`` (3 J, 3 J); mean root depth in mm."""
+
+    mean: Floats
+    covariance: Floats
+    root_depth_mm: float
+
+
+def place_ensemble(
+    exemplars_mm: Floats,
+    rotations: Floats,
+    points: Floats,
+    weights: Floats,
+    proportion_spread: float,
+) -> Ensemble:
+    """Move exemplars in front of the camera: library rotation, least-squares translation.
+
+    The rotation is left as the library has it: turning every neighbour onto the observation (eq. 5)
+    fits its noise and hides from the regression how the image changes with the view.
+
+    Args:
+        exemplars_mm: (K, J, 3) exemplar frame, nearest first.
+        rotations: (K, 3, 3) of the library cameras.
+        points: (J, 2) observed, normalised image coordinates of the centred view.
+        weights: (J,) 0 = missing.
+        proportion_spread: standard deviation of the log of a segment's length about the library's;
+            0 for none.
+
+    """
+    rotated = exemplars_mm @ np.swapaxes(rotations, 1, 2)
+    typical = rotated[:_TYPICAL].mean(0)
+    shaped = typical + proportion_spread * proportion_directions(typical)
+    posed = np.concatenate([rotated, typical[None], shaped])
+    placed = posed + initial_translation(posed, points, weights)[:, None]
+    root_depth = 0.5 * (placed[:, R_HIP, 2] + placed[:, L_HIP, 2])
+    n = len(rotated)
+    px_per_unit = STANDARD_PX_PER_MM * float(np.sort(root_depth[:n])[n // 2])
+    depth = placed[..., 2]
+    image = px_per_unit * placed[..., :2] / depth[..., None]
+    states = np.concatenate(
+        [image.reshape(len(posed), -1), depth / root_depth[:, None] - 1.0], axis=1
+    )
+    return Ensemble(
+        states=states[:n],
+        root_depth_mm=root_depth[:n],
+        proportions=states[n + 1 :] - states[n],
+        px_per_unit=px_per_unit,
+    )
+
+
+def local_prior(
+    ensemble: Ensemble,
+    rows: Integers,
+    observed: Floats,
+    *,
+    bandwidth_px: float,
+    adaptive: float,
+    granularity_px: float,
+    localisation_bones: float,
+) -> LocalPrior:
+    """The ensemble's Gaussian about an observation.
+
+    Args:
+        ensemble: the neighbours.
+        rows: which image coordinates of the state are observed.
+        observed: (2 J,) their values at ``rows``, standard pixels.
+        bandwidth_px: kernel over the image distance of a neighbour, standard pixels a coordinate.
+        adaptive: how much of the nearest neighbour's mean squared residual is added to the
+            kernel's variance, for people the library knows less densely.
+        granularity_px: spread of a projection that no neighbour accounts for.
+        localisation_bones: bones over which a covariance between joints fades to 1/e.
+
+    """
+    residual = ensemble.states[:, rows] - observed[rows]
+    squared = (residual**2).sum(1)
+    if len(ensemble.proportions):
+        # Woodbury: the distance in the metric of bandwidth² I + Gᵀ G.
+        explained = ensemble.proportions[:, rows] / bandwidth_px
+        inner = np.eye(len(explained)) + explained @ explained.T
+        reach = residual @ explained.T
+        squared -= ((reach @ np.linalg.inv(inner)) * reach).sum(1)
+    # Per coordinate; two coordinates a joint less the translation and scale already fitted.
+    nearest = squared.min() / max(len(rows) - 4, 1)
+    variance = bandwidth_px**2 + adaptive * nearest
+    weights = np.exp(-0.5 * (squared - squared.min()) / variance)
+    weights /= weights.sum()
+
+    mean = weights @ ensemble.states
+    anomalies = np.sqrt(weights)[:, None] * (ensemble.states - mean)
+    covariance = _state_factors(localisation_bones) * (anomalies.T @ anomalies)
+    covariance += ensemble.proportions.T @ ensemble.proportions
+    image = np.arange(2 * LSP14.n_joints)
+    covariance[image, image] += granularity_px**2
+    return LocalPrior(mean, covariance, float(weights @ ensemble.root_depth_mm))
+
+
+@cache
+def localisation(bones: float, skeleton: Skeleton = LSP14) -> Floats:
+    """(J, J) factors exp(-d / bones), d the bones between two joints; positive definite."""
+    n = skeleton.n_joints
+    distance = np.where(np.eye(n, dtype=bool), 0.0, np.inf)
+    for parent, child in skeleton.edges:
+        distance[parent, child] = distance[child, parent] = 1.0
+    for via in range(n):
+        distance = np.minimum(distance, distance[:, via, None] + distance[None, via, :])
+    factors: Floats = np.exp(-distance / bones)
+    factors.flags.writeable = False
+    return factors
+
+
+@cache
+def _state_factors(bones: float) -> Floats:
+    """:func:`localisation` by coordinate of the state, (3 J, 3 J)."""
+    joints = np.arange(LSP14.n_joints)
+    joint_of = np.concatenate([np.repeat(joints, 2), joints])
+    factors: Floats = localisation(bones)[np.ix_(joint_of, joint_of)]
+    factors.flags.writeable = False
+    return factors

@@ -1,0 +1,41 @@
+import numpy as np
+
+from app.lifting.proportions import asymmetry, proportion_directions
+from app.lifting.stature import stature_mm
+from library_store.anatomy import measure_lengths
+from library_store.library import Library
+
+
+def test_directions_change_lengths_and_neither_angles_nor_stature(library: Library) -> None:
+    pose = library.poses_mm(17)
+    lengths = measure_lengths(pose)
+    for direction in proportion_directions(pose):
+        moved = pose + 1e-3 * direction
+        assert abs(stature_mm(moved) / stature_mm(pose) - 1.0) < 2e-5
+        for start, end in ((1, 0), (2, 3), (3, 4), (9, 10), (12, 13)):
+            bones = [joints[end] - joints[start] for joints in (pose, moved)]
+            cosine = bones[0] @ bones[1] / np.prod(np.linalg.norm(bones, axis=1))
+            assert cosine > 1.0 - 1e-9
+        np.testing.assert_allclose(moved[8] + moved[11], 0.0, atol=1e-3)
+    moved_lengths = np.stack(
+        [
+            np.log(measure_lengths(pose + 1e-4 * direction) / lengths) / 1e-4
+            for direction in proportion_directions(pose)
+        ]
+    )
+    # Seven independent directions of unit spread.
+    np.testing.assert_allclose(moved_lengths @ moved_lengths.T, np.eye(7), atol=0.02)
+
+
+def test_asymmetry_and_its_derivative(library: Library) -> None:
+    pose = library.poses_mm(5)
+    ratio, derivative = asymmetry(pose)
+    assert np.abs(ratio).max() < 0.2
+    for joint, axis in ((3, 0), (8, 1), (13, 2), (1, 1)):
+        moved = pose.copy()
+        moved[joint, axis] += 1e-3
+        numeric = (asymmetry(moved)[0] - ratio) / 1e-3
+        np.testing.assert_allclose(derivative[:, joint, axis], numeric, atol=1e-8)
+    longer = pose.copy()
+    longer[4] += longer[4] - longer[3]
+    np.testing.assert_allclose((asymmetry(longer)[0] - ratio)[2], np.log(2.0))
