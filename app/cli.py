@@ -7,7 +7,7 @@ import sys
 import typer
 from rich.markup import escape
 
-from app.commands import bench, doctor, evaluate, library, predict, serve
+from app.commands import bench, doctor, evaluate, library, model, predict, serve
 from app.commands.console import notices, output
 from app.errors import PoseMatchError, RequestError
 from app.version import VERSION
@@ -23,6 +23,7 @@ cli = typer.Typer(
 cli.command()(serve.serve)
 cli.command()(predict.predict)
 cli.add_typer(library.commands, name="library")
+cli.add_typer(model.commands, name="model")
 cli.command(context_settings=evaluate.PASS_ON)(evaluate.evaluate)
 cli.command()(bench.bench)
 cli.command()(doctor.doctor)
@@ -45,5 +46,7 @@ def main() -> None:
         notices.print(f"[red]error:[/red] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(1)
     except PoseMatchError as error:
-        notices.print(f"[red]cannot start:[/red] {error}", highlight=False, soft_wrap=True)
+        notices.print(
+            f"[red]cannot start:[/red] {escape(str(error))}", highlight=False, soft_wrap=True
+        )
         sys.exit(1)

@@ -21,6 +21,7 @@ from library_store.skeleton import LSP14
 from models.card import WEIGHTS_DIR, DetectorOutput, ModelCard, PoseOutput, write_card
 from models.training.augment import CROP_SCALE
 from models.training.network import (
+    BACKGROUND,
     ConvolutionalPoseMachine,
     CpmConfig,
     PersonConfig,
@@ -68,6 +69,23 @@ def read_weights(path: Path) -> dict[str, Tensor]:
             value = numpy_helper.to_array(initializer).astype(np.float32)
             weights[name.removeprefix(PREFIX)] = torch.from_numpy(value)
     return weights
+
+
+def config_of(weights: dict[str, Tensor]) -> CpmConfig:
+    """The sizes of a CPM, from its weights."""
+    score = weights["fine_score.weight"]
+
+    def count(prefix: str) -> int:
+        return len({k.removeprefix(prefix).split(".")[0] for k in weights if k.startswith(prefix)})
+
+    n4, n8, n16, n32 = (count(f"backbone.c{stride}.") for stride in (4, 8, 16, 32))
+    return CpmConfig(
+        n_joints=len(score) - BACKGROUND,
+        width=score.shape[1],
+        blocks=(n4, n8, n16, n32),
+        stage_width=weights["stages.0.score.weight"].shape[1],
+        n_stages=count("stages."),
+    )
 
 
 def pose_card(network: ConvolutionalPoseMachine, name: str, version: str, size: int) -> ModelCard:
@@ -166,7 +184,7 @@ def export(
         person.load_state_dict(state["ema"])
         size = size_px or PHOTO_PX
         card, model = person_card(person, name or kind, version, size), person_model(person)
-    card = card.model_copy(update={"measured": {"training_steps": state["step"]}})
+    card = card.model_copy(update={"measured": {"training_steps": float(state["step"])}})
     return publish(model, card, directory)
 
 

@@ -1,0 +1,265 @@
+"""``posematch model``: the networks' cards, checks, export, and training on one's own images."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from app.commands.console import output
+from app.engine import chosen_networks
+from app.errors import StartupError
+from app.settings import Settings, load_settings
+from models import ModelCard, ModelError, ProviderChoice
+from models.card import read_card, write_card
+from models.choice import cards_of
+from models.cost import cpu_ms
+from models.session import OnnxModel
+
+commands = typer.Typer(
+    help="The networks: cards, checks, export, training on your own images.",
+    no_args_is_help=True,
+    rich_markup_mode=None,
+)
+TRAINING_PACKAGES = {"torch", "onnx", "matplotlib"}
+
+Name = Annotated[
+    str | None,
+    typer.Argument(help="A card's name in POSEMATCH_WEIGHTS_DIR; default: all there are."),
+]
+
+
+@commands.command("card")
+def print_card(
+    name: Name = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the card itself.")] = False,
+) -> None:
+    """Print what a network is, what it learned from, what it costs and how good it is.
+
+    The ones that would serve here are marked with a star.
+    """
+    settings = load_settings()
+    try:
+        if name is not None:
+            card = _card(settings, name)
+            if as_json:
+                output.print_json(card.model_dump_json())
+            else:
+                output.print(_card_table(card))
+            return
+        chosen = chosen_networks(settings)
+        cards = _all_cards(settings)
+    except ModelError as error:
+        raise StartupError(str(error)) from error
+    if as_json:
+        output.print_json(json.dumps([card.model_dump(mode="json") for card in cards]))
+        return
+    table = Table()
+    for heading in ("", "network", "version", "accuracy", "GFLOP", "parameters", "CPU-ms"):
+        table.add_column(heading)
+    for card in cards:
+        table.add_row(
+            "*" if card.name in chosen else "",
+            escape(card.name),
+            escape(card.version),
+            "unknown" if card.accuracy is None else f"{card.accuracy:.3f}",
+            f"{card.gflop:.2f}",
+            f"{card.parameters:,}",
+            _costs(card.cost_ms),
+        )
+    output.print(table)
+
+
+@commands.command("check")
+def check(
+    name: Name = None,
+    provider: Annotated[
+        ProviderChoice | None, typer.Option(help="Default POSEMATCH_PROVIDER.")
+    ] = None,
+    save: Annotated[bool, typer.Option(help="Write the cost into the card.")] = False,
+) -> None:
+    """Load a network as the service would, run it, and say what it costs here.
+
+    Checked are the card, the file's SHA-256, whether onnxruntime and the provider can run it, its
+    inputs, outputs and batches. Exit code: 0 when all is well, 1 when not.
+    """
+    settings = load_settings()
+    wanted = provider or settings.provider
+    table = Table()
+    for heading in ("network", "runs on", "input", "CPU-ms an input", "as its card has it"):
+        table.add_column(heading)
+    try:
+        for card in _all_cards(settings) if name is None else [_card(settings, name)]:
+            model = OnnxModel(settings.weights_dir, card.name, provider=wanted)
+            spent_ms = round(cpu_ms(model), 2)
+            stated = card.cost_ms.get(str(model.runtime))
+            table.add_row(
+                f"{escape(card.name)} {escape(card.version)}",
+                str(model.runtime),
+                f"{card.output.side_px} px",
+                f"{spent_ms:.2f}",
+                "-" if stated is None else f"{stated:.2f}",
+            )
+            if save:
+                costs = card.cost_ms | {str(model.runtime): spent_ms}
+                path = settings.weights_dir / f"{card.name}.json"
+                write_card(path, card.model_copy(update={"cost_ms": costs}))
+    except ModelError as error:
+        raise StartupError(str(error)) from error
+    output.print(table)
+
+
+@commands.command("export")
+def export(
+    checkpoint: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="A last.pt.")],
+    out: Annotated[Path, typer.Option(help="Directory for the ONNX file and its card.")],
+    version: Annotated[str, typer.Option(help="Of the weights; users see it in every answer.")],
+    kind: Annotated[str, typer.Option(help="cpm or person.")] = "cpm",
+    name: Annotated[str | None, typer.Option(help="Of the card; default the kind.")] = None,
+    input_px: Annotated[int | None, typer.Option(min=32, help="Default as trained.")] = None,
+) -> None:
+    """Make a training run's checkpoint into an ONNX file and its card.
+
+    Serve it with POSEMATCH_WEIGHTS_DIR=OUT POSEMATCH_MODEL=NAME (the person network's files have to
+    lie there too).
+    """
+    if kind not in {"cpm", "person"}:
+        raise typer.BadParameter("cpm or person", param_hint="--kind")
+    try:
+        from models.training import export as training
+    except ModuleNotFoundError as error:
+        raise _needs_training(error) from error
+    network: training.Kind = "cpm" if kind == "cpm" else "person"
+    try:
+        card = training.export(
+            checkpoint, out, network, version=version, name=name, size_px=input_px
+        )
+        OnnxModel(out, card.name)
+    except ModelError as error:
+        raise StartupError(str(error)) from error
+    output.print(f"{out / card.file}, {card.name}.json", highlight=False, markup=False)
+
+
+@commands.command("finetune")
+def finetune(
+    out: Annotated[Path, typer.Option(help="Directory for the new weights and their card.")],
+    coco: Annotated[
+        Path | None, typer.Option(exists=True, dir_okay=False, help="A COCO keypoints JSON.")
+    ] = None,
+    images: Annotated[
+        Path | None,
+        typer.Option(exists=True, file_okay=False, help="Folder of its file_names."),
+    ] = None,
+    human36m: Annotated[
+        Path | None,
+        typer.Option(exists=True, file_okay=False, help="Human3.6M: S*/MyPoseFeatures, S*/Videos."),
+    ] = None,
+    start: Annotated[str, typer.Option(help="Card to start from (fp32).")] = "cpm",
+    name: Annotated[str, typer.Option(help="Of the new card.")] = "finetuned",
+    steps: Annotated[int, typer.Option(min=1)] = 500,
+    minutes: Annotated[float | None, typer.Option(min=0.1, help="End by then.")] = None,
+    lr: Annotated[float, typer.Option(min=1e-7, max=1e-1, help="Learning rate.")] = 3e-4,
+    hold_out: Annotated[float, typer.Option(min=0.01, max=0.9, help="Share of images.")] = 0.15,
+    seed: Annotated[int, typer.Option()] = 0,
+    threads: Annotated[int, typer.Option(min=1)] = 2,
+) -> None:
+    """Train the pose network further on your own labelled images.
+
+    Labels are a COCO keypoints file with the folder of its images, or Human3.6M as unpacked. Whole
+    images (clips) are held out and measured before and after. Needs the extra `train`.
+
+    \b
+    posematch model finetune --coco person_keypoints.json --images photos --out ours
+    """  # noqa: D301
+    if (coco is None) == (human36m is None):
+        raise typer.BadParameter("give either --coco or --human36m", param_hint="labels")
+    if (coco is None) != (images is None):
+        raise typer.BadParameter("--coco and --images belong together", param_hint="--images")
+    settings = load_settings()
+    try:
+        from models.training import finetune as training
+        from models.training.users_coco import read_coco
+        from models.training.users_h36m import read_human36m
+    except ModuleNotFoundError as error:
+        raise _needs_training(error) from error
+    try:
+        if coco is not None and images is not None:
+            crops, source = read_coco(coco, images), f"{coco.name} (the user's own labels)"
+        else:
+            assert human36m is not None
+            crops, source = read_human36m(human36m), "Human3.6M (academic use only)"
+        result = training.finetune(
+            crops,
+            weights_dir=settings.weights_dir,
+            start=start,
+            out=out,
+            name=name,
+            source=source,
+            settings=training.FinetuneSettings(
+                steps=steps,
+                minutes=minutes,
+                lr=lr,
+                hold_out=hold_out,
+                seed=seed,
+                threads=threads,
+            ),
+        )
+    except ModelError as error:
+        raise StartupError(str(error)) from error
+    table = Table(title=f"{result.n_trained} people trained on, {result.n_held_out} held out")
+    for heading in ("PCK@0.2 of those held out", "%"):
+        table.add_column(heading)
+    table.add_row(f"before ({escape(start)})", f"{100 * result.before:.1f}")
+    table.add_row(f"after ({escape(name)})", f"{100 * result.after:.1f}")
+    output.print(table)
+    output.print(f"{out / result.card.file}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _needs_training(error: ModuleNotFoundError) -> Exception:
+    """What to tell whoever has not installed the extra; other errors stay what they are."""
+    if (error.name or "").partition(".")[0] not in TRAINING_PACKAGES:
+        return error
+    return StartupError(
+        f"training and export need {error.name}: install posematch with its extra, "
+        "pip install 'posematch[train]'"
+    )
+
+
+def _card(settings: Settings, name: str) -> ModelCard:
+    return read_card(settings.weights_dir / f"{name}.json")
+
+
+def _all_cards(settings: Settings) -> list[ModelCard]:
+    where = settings.weights_dir
+    return [*cards_of(where, "pose"), *cards_of(where, "people")]
+
+
+def _costs(cost_ms: dict[str, float]) -> str:
+    return ", ".join(f"{cost:.1f} {runtime}" for runtime, cost in cost_ms.items()) or "unknown"
+
+
+def _card_table(card: ModelCard) -> Table:
+    table = Table(show_header=False)
+    rows = {
+        "name": f"{card.name} {card.version}",
+        "what it is": card.description,
+        "file": f"{card.file}, sha256 {card.sha256}",
+        "precision": card.precision,
+        "providers": ", ".join(card.providers),
+        "CPU features": ", ".join(card.cpu_features) or "any",
+        "input": f"{card.output.side_px} px",
+        "cost": f"{card.gflop:.2f} GFLOP, {card.multiply_adds / 1e9:.2f} GMAC, "
+        f"{card.parameters:,} parameters",
+        "CPU-ms an input": _costs(card.cost_ms),
+        "learned from": "\n".join(card.training_data),
+        "licence": card.licence,
+        "limits": "\n".join(card.limits),
+        "measured": "\n".join(f"{key}: {value}" for key, value in card.measured.items()),
+    }
+    for key, value in rows.items():
+        table.add_row(key, escape(value))
+    return table

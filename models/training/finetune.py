@@ -1,0 +1,198 @@
+"""Going on from the shipped weights with a user's own labelled people: see :func:`finetune`.
+
+Behind ``posematch model finetune``. A share of the images (whole images, whole clips) is held out,
+measured before and after through the files that are served.
+"""
+
+from __future__ import annotations
+
+import argparse
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from models.card import ModelCard, PoseOutput, read_card, write_card
+from models.errors import AnnotationError, ModelError
+from models.heatmaps import read_maps
+from models.pck import correct_keypoints
+from models.session import OnnxModel
+from models.training import loop
+from models.training.augment import canonical, random_view
+from models.training.dataset import LabelledCrop
+from models.training.export import config_of, pose_card, publish, read_weights
+from models.training.network import ConvolutionalPoseMachine
+from models.training.objective import total_loss
+from models.training.onnx_graph import pose_model
+from models.training.train import measure, to_batch
+
+TORSO = (2, 5, 8, 11)
+"""Without shoulders and hips there is no torso to measure errors by."""
+LEAST_HELD, LEAST_TRAINED = 5, 20
+BATCH_MOST = 32
+
+
+@dataclass(frozen=True)
+class FinetuneSettings:
+    """How long and how fast; ``minutes`` brings the schedule to its end by then."""
+
+    steps: int = 500
+    minutes: float | None = None
+    lr: float = 3e-4
+    hold_out: float = 0.15
+    seed: int = 0
+    threads: int = 2
+
+
+@dataclass(frozen=True)
+class FinetuneResult:
+    """PCK@0.2 of the held-out people with the old and with the new weights, as shares of one."""
+
+    card: ModelCard
+    n_trained: int
+    n_held_out: int
+    before: float
+    after: float
+
+
+def split(
+    crops: list[LabelledCrop], share: float, seed: int
+) -> tuple[list[LabelledCrop], list[LabelledCrop]]:
+    """(train, held out); people of one image or clip stay together.
+
+    Raises ``AnnotationError`` when either part would be too small.
+    """
+    groups = sorted({crop.group for crop in crops})
+    order = sorted(groups, key=lambda g: zlib.crc32(f"{seed}/{g}".encode()))
+    kept = set(order[: max(1, round(share * len(groups)))])
+    held = [c for c in crops if c.group in kept and (c.weight[list(TORSO)] > 0).all()]
+    train = [c for c in crops if c.group not in kept]
+    if len(held) < LEAST_HELD or len(train) < LEAST_TRAINED:
+        raise AnnotationError(
+            f"{len(crops)} labelled people in {len(groups)} images or clips leave {len(train)} to "
+            f"train on and {len(held)} with shoulders and hips to measure on; at least "
+            f"{LEAST_TRAINED} and {LEAST_HELD} are needed: label more images, or change --hold-out"
+        )
+    return train, held
+
+
+def pck(directory: Path, name: str, crops: list[LabelledCrop]) -> float:
+    """PCK@0.2 of an exported network over the labelled joints."""
+    model = OnnxModel(directory, name)
+    output = model.card.output
+    assert isinstance(output, PoseOutput)
+    right = total = 0
+    for crop in crops:
+        sample = canonical(crop, output.input_px)
+        maps = model.run(sample.image[None])
+        cells = read_maps(maps, len(output.joint_names), output.maps, output.target_sigma_cells).at[
+            0
+        ]
+        found = (cells + 0.5) * output.stride_px - 0.5
+        known = sample.weight > 0
+        right += int(correct_keypoints(found, sample.joints_px)[known].sum())
+        total += int(known.sum())
+    return right / total
+
+
+def finetune(
+    crops: list[LabelledCrop],
+    *,
+    weights_dir: Path,
+    start: str,
+    out: Path,
+    name: str,
+    source: str,
+    settings: FinetuneSettings,
+) -> FinetuneResult:
+    """Train on ``crops`` from the weights of card ``start``; write ``out/name.onnx`` and card.
+
+    ``source`` says in the card what was trained on. The training run itself is kept in
+    ``out/run`` and is resumed from there. Raises ``ModelError``.
+    """
+    before_card = read_card(weights_dir / f"{start}.json")
+    output = before_card.output
+    if not isinstance(output, PoseOutput) or before_card.precision != "fp32":
+        raise ModelError(f"model {start} cannot be trained on: name an fp32 pose network's card")
+    train, held = split(crops, settings.hold_out, settings.seed)
+    before = pck(weights_dir, start, held)
+    path = weights_dir / before_card.file
+    config = config_of(read_weights(path))
+    size = output.input_px
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    args = argparse.Namespace(
+        out=out / "run",
+        init=path,
+        steps=settings.steps,
+        minutes=settings.minutes,
+        batch=min(BATCH_MOST, len(train)),
+        lr=settings.lr,
+        optimizer="adamw",
+        seed=settings.seed,
+        threads=settings.threads,
+        every=min(100, settings.steps),
+        device=device,
+    )
+
+    def make_batch(step: int, size: int) -> loop.Batch:
+        rng = np.random.default_rng((settings.seed, step))
+        picked = rng.integers(0, len(train), (args.batch, 2))
+        return to_batch([random_view(train[i], train[j], size, rng) for i, j in picked])
+
+    def loss_of(model: ConvolutionalPoseMachine, batch: loop.Batch) -> Tensor:
+        x, joints, weight, presence = batch
+        with torch.autocast(device, torch.bfloat16):
+            stages = model(x)
+        return total_loss(stages, joints, weight, presence, x.shape[-1])
+
+    loop.fit(
+        ConvolutionalPoseMachine(config),
+        args,
+        sizes=[(1.0, size)],
+        make_batch=make_batch,
+        loss_of=loss_of,
+        evaluate=lambda model, px: {"pck_0.2/held_out": measure(model, held, px, device)},
+        config=config.as_dict(),
+    )
+    state = torch.load(args.out / "last.pt", map_location="cpu", weights_only=True)
+    network = ConvolutionalPoseMachine(config)
+    network.load_state_dict(state["ema"])
+    network.eval()
+    fresh = pose_card(network, name, f"{before_card.version}+{name}", size)
+    card = publish(
+        pose_model(network, size),
+        fresh.model_copy(
+            update={
+                "output": _calibration_inherited(output, start),
+                "training_data": [*before_card.training_data, source],
+                "limits": before_card.limits,
+                "licence": f"{before_card.licence}; and whatever {source} demands",
+                "cost_ms": before_card.cost_ms,
+            }
+        ),
+        out,
+    )
+    after = pck(out, name, held)
+    measured: dict[str, float | str] = {
+        "training_steps": float(state["step"]),
+        "held_out_people": float(len(held)),
+        "pck_0.2/held_out/before": round(before, 4),
+        "pck_0.2/held_out/after": round(after, 4),
+    }
+    card = card.model_copy(update={"measured": measured})
+    write_card(out / f"{name}.json", card)
+    return FinetuneResult(card, len(train), len(held), before, after)
+
+
+def _calibration_inherited(output: PoseOutput, start: str) -> PoseOutput:
+    """The old network's calibration, which says so: a few images are too few to fit it anew."""
+    said = f"{{}}; of {start}, which this network was fine-tuned from"
+    update = {
+        key: part.model_copy(update={"fitted_on": said.format(part.fitted_on)})
+        for key in ("confidence", "spread")
+        if (part := getattr(output, key)) is not None
+    }
+    return output.model_copy(update=update)

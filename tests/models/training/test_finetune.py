@@ -1,0 +1,79 @@
+"""Fine-tuning from an exported network on a user's images; needs the train extra."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("onnx")
+
+from models import ModelError, PoseEstimator  # noqa: E402
+from models.errors import AnnotationError  # noqa: E402
+from models.person_detector import PersonBox  # noqa: E402
+from models.training import export  # noqa: E402
+from models.training.finetune import FinetuneSettings, finetune, split  # noqa: E402
+from models.training.network import ConvolutionalPoseMachine, CpmConfig  # noqa: E402
+from models.training.onnx_graph import pose_model  # noqa: E402
+from models.training.users_coco import read_coco  # noqa: E402
+from tests.models.training import user_files  # noqa: E402
+
+SIZE_PX = 64
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Path:
+    """A directory with the card of an untrained network."""
+    torch.manual_seed(0)
+    config = CpmConfig(width=16, blocks=(1, 1, 1, 1), stage_width=16, n_stages=2)
+    network = ConvolutionalPoseMachine(config).eval()
+    card = export.pose_card(network, "start", "1", SIZE_PX)
+    export.publish(pose_model(network, SIZE_PX), card, tmp_path / "weights")
+    return tmp_path / "weights"
+
+
+def test_it_learns_a_users_people_and_serves_by_card(start: Path, tmp_path: Path) -> None:
+    records = user_files.coco(tmp_path / "images", 24)
+    crops = read_coco(user_files.write(tmp_path / "l.json", records), tmp_path / "images")
+    result = finetune(
+        crops,
+        weights_dir=start,
+        start="start",
+        out=tmp_path / "out",
+        name="ours",
+        source="drawings",
+        settings=FinetuneSettings(steps=120, lr=3e-3, hold_out=0.25, threads=1),
+    )
+    assert result.n_trained + result.n_held_out <= len(crops)
+    assert result.after > result.before + 0.15, "people of one kind are learned quickly"
+    assert result.card.measured["pck_0.2/held_out/after"] == round(result.after, 4)
+    assert result.card.training_data[-1] == "drawings"
+    estimator = PoseEstimator("ours", weights_dir=tmp_path / "out")
+    joints = estimator.estimate(np.zeros((80, 80, 3), np.uint8), [PersonBox(8, 8, 60, 60, 1.0)])
+    assert joints[0].positions_px.shape == (14, 2)
+
+
+def test_what_cannot_be_trained_on_is_refused(tmp_path: Path) -> None:
+    records = user_files.coco(tmp_path / "images", 3)
+    crops = read_coco(user_files.write(tmp_path / "l.json", records), tmp_path / "images")
+    with pytest.raises(AnnotationError, match="label more images"):
+        split(crops, 0.15, 0)
+    with pytest.raises(ModelError, match="name an fp32 pose network"):
+        finetune(
+            crops,
+            weights_dir=export.WEIGHTS_DIR,
+            start="person",
+            out=tmp_path / "out",
+            name="ours",
+            source="",
+            settings=FinetuneSettings(),
+        )
+
+
+def test_people_of_one_image_stay_on_one_side(tmp_path: Path) -> None:
+    records = user_files.coco(tmp_path / "images", 40)
+    crops = read_coco(user_files.write(tmp_path / "l.json", records), tmp_path / "images")
+    train, held = split(crops, 0.3, 0)
+    assert not {c.group for c in train} & {c.group for c in held}

@@ -1,0 +1,197 @@
+"""Users' labelled images: what is read, and what is refused with a reason."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from library_store.skeleton import LSP14
+from models.errors import AnnotationError
+from models.training.users_coco import KEPT_PX, read_coco
+from models.training.users_h36m import read_human36m
+from tests.models.training import user_files
+
+JOINT = {name: i for i, name in enumerate(LSP14.joint_names)}
+Records = dict[str, Any]
+
+
+def test_coco_people_become_crops_in_our_joint_order(tmp_path: Path) -> None:
+    records = user_files.coco(tmp_path / "images")
+    path = user_files.write(tmp_path / "labels.json", records)
+    crops = read_coco(path, tmp_path / "images")
+    assert len(crops) == 6
+    assert [crop.group for crop in crops] == [0, 0, 1, 1, 2, 2]
+    first, second = crops[:2]
+    assert first.weight[JOINT["head_top"]] == first.weight[JOINT["neck"]] == 0
+    assert first.weight[2:].all()
+    assert second.weight.sum() == 8, "legs are not labelled"
+    # The person's own left shoulder is on the picture's right.
+    assert first.joints_px[JOINT["l_shoulder"], 0] > first.joints_px[JOINT["r_shoulder"], 0]
+    # Places in the crop are those in the photo: a patch around the elbow is the same there.
+    photo = cv2.imread(str(tmp_path / "images" / "0.png"))
+    assert photo is not None
+    points = np.array(records["annotations"][0]["keypoints"]).reshape(-1, 3)
+    x, y = points[user_files.NAMES.index("left_hip"), :2].round().astype(int)
+    u, v = first.joints_px[JOINT["l_hip"]].round().astype(int)
+    patch, other = photo[y - 6 : y + 7, x - 6 : x + 7], first.image[v - 6 : v + 7, u - 6 : u + 7]
+    assert np.corrcoef(patch.ravel(), other.ravel())[0, 1] > 0.9
+    assert max(crop.image.shape[0] for crop in crops) <= KEPT_PX
+
+
+def test_names_are_understood_in_other_spellings(tmp_path: Path) -> None:
+    records = user_files.coco(tmp_path / "images", 1)
+    names = [n.replace("left_", "L ").replace("right_", "R-") for n in user_files.NAMES]
+    records["categories"][0]["keypoints"] = [*names[1:], "Head-Top"]
+    for record in records["annotations"]:
+        record["keypoints"] = [*record["keypoints"][3:], *record["keypoints"][:3]]
+    crops = read_coco(user_files.write(tmp_path / "l.json", records), tmp_path / "images")
+    assert crops[0].weight[JOINT["head_top"]] == 1
+
+
+def _set(index: int, value: float) -> Callable[[Records], None]:
+    def change(records: Records) -> None:
+        records["annotations"][0]["keypoints"][index] = value
+
+    return change
+
+
+def _normalised(records: Records) -> None:
+    for record in records["annotations"]:
+        record["keypoints"] = [
+            v if i % 3 == 2 else v / 400 for i, v in enumerate(record["keypoints"])
+        ]
+
+
+DAMAGE: dict[str, tuple[Callable[[Records], object], str]] = {
+    "no categories": (lambda r: r.pop("categories"), "categories: Field required"),
+    "boxes only": (lambda r: r["categories"][0].pop("keypoints"), "no category has keypoints"),
+    "other names": (
+        lambda r: r["categories"][0].update(keypoints=[f"k{i}" for i in range(13)]),
+        "lacks the keypoints l_ankle",
+    ),
+    "numbers missing": (
+        lambda r: r["annotations"][0]["keypoints"].pop(),
+        "annotation 0 has 38 numbers",
+    ),
+    "text": (lambda r: r["annotations"][0].update(keypoints=["a"]), r"annotations\.0\.keypoints"),
+    "confidences": (_set(5, 0.7), "visibility that is not 0, 1 or 2"),
+    "outside": (_set(3, 5000.0), r"annotation 0 has a keypoint at \(5000,.*320x240"),
+    "normalised": (_normalised, "lie within 0..1"),
+    "image gone": (lambda r: r["images"][0].update(file_name="x.png"), "does not exist"),
+    "resized": (lambda r: r["images"][0].update(width=640, height=480), "resized or turned"),
+    "unknown image": (lambda r: r["images"].pop(0), "image 0, which is not among images"),
+    "nobody": (lambda r: r["annotations"].clear(), "nothing to learn"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_doubtful_coco_files_are_refused(tmp_path: Path, damage: str) -> None:
+    change, said = DAMAGE[damage]
+    records = user_files.coco(tmp_path / "images")
+    change(records)
+    path = user_files.write(tmp_path / "labels.json", records)
+    with pytest.raises(AnnotationError, match=said) as refusal:
+        read_coco(path, tmp_path / "images")
+    assert "labels.json" in str(refusal.value)
+
+
+def test_a_file_that_is_no_json_or_not_there(tmp_path: Path) -> None:
+    (tmp_path / "labels.json").write_text("{")
+    with pytest.raises(AnnotationError, match="no COCO keypoints file"):
+        read_coco(tmp_path / "labels.json", tmp_path)
+    with pytest.raises(AnnotationError, match="no such file"):
+        read_coco(tmp_path / "none.json", tmp_path)
+
+
+def test_a_picture_that_cannot_be_decoded(tmp_path: Path) -> None:
+    records = user_files.coco(tmp_path / "images")
+    (tmp_path / "images" / "1.png").write_bytes(b"oops")
+    with pytest.raises(AnnotationError, match=r"1\.png is no image"):
+        read_coco(user_files.write(tmp_path / "labels.json", records), tmp_path / "images")
+
+
+N_FRAMES, APART = 30, 10
+
+
+@pytest.fixture
+def human36m(tmp_path: Path) -> Path:
+    """One clip of a person who walks to the right, as the authors lay it out."""
+    from cdflib import cdfwrite
+
+    root = tmp_path / "h36m"
+    poses = root / "S1" / "MyPoseFeatures" / "D2_Positions"
+    videos = root / "S1" / "Videos"
+    poses.mkdir(parents=True)
+    videos.mkdir()
+    pose = np.full((N_FRAMES, 32, 2), 50.0)
+    order = {13: "nose", 17: "left_shoulder", 18: "left_elbow", 19: "left_wrist"}
+    order |= {25: "right_shoulder", 26: "right_elbow", 27: "right_wrist", 1: "right_hip"}
+    order |= {2: "right_knee", 3: "right_ankle", 6: "left_hip", 7: "left_knee", 8: "left_ankle"}
+    order |= {15: "nose"}
+    writer = cv2.VideoWriter(
+        str(videos / "Walking 1.54138969.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 50, (320, 240)
+    )
+    for i in range(N_FRAMES):
+        at = {n: user_files.place(n, 80 + 5 * i, 120, 1.0) for n in user_files.NAMES}
+        image = np.zeros((240, 320, 3), np.uint8)
+        user_files.draw(image, at)
+        writer.write(image)
+        for index, name in order.items():
+            pose[i, index] = at[name]
+    writer.release()
+    out = cdfwrite.CDF(str(poses / "Walking 1.54138969.cdf"), cdf_spec={"Compressed": 0})
+    out.write_var(
+        {
+            "Variable": "Pose",
+            "Data_Type": 45,
+            "Num_Elements": 1,
+            "Rec_Vary": True,
+            "Var_Type": "zVariable",
+            "Dim_Sizes": [N_FRAMES, 64],
+        },
+        var_data=pose.reshape(1, N_FRAMES, 64),
+    )
+    out.close()
+    np.savez(tmp_path / "pose.npz", Pose=pose.reshape(N_FRAMES, 64))
+    return root
+
+
+def test_frames_of_human36m_lie_under_their_poses(human36m: Path) -> None:
+    crops = read_human36m(human36m, frames_apart=APART)
+    assert len(crops) == N_FRAMES // APART
+    for crop in crops:
+        u, v = crop.joints_px[JOINT["l_hip"]].round().astype(int)
+        assert crop.image[v - 2 : v + 3, u - 2 : u + 3].mean() > 60, "the figure is there"
+        assert crop.joints_px[JOINT["l_hip"], 0] > crop.joints_px[JOINT["r_hip"], 0]
+
+
+def test_npz_may_stand_for_cdf(human36m: Path, tmp_path: Path) -> None:
+    folder = human36m / "S1" / "MyPoseFeatures" / "D2_Positions"
+    cdf = read_human36m(human36m, frames_apart=APART)
+    (folder / "Walking 1.54138969.cdf").unlink()
+    (tmp_path / "pose.npz").rename(folder / "Walking 1.54138969.npz")
+    npz = read_human36m(human36m, frames_apart=APART)
+    for a, b in zip(cdf, npz, strict=True):
+        np.testing.assert_array_equal(a.joints_px, b.joints_px)
+
+
+def test_human36m_that_is_not_whole_is_refused(human36m: Path) -> None:
+    with pytest.raises(AnnotationError, match="in a folder S9"):
+        read_human36m(human36m, ("S9",))
+    folder = human36m / "S1" / "MyPoseFeatures" / "D2_Positions"
+    np.savez(folder / "Sitting.npz", Pose=np.zeros((5, 96)))
+    video = human36m / "S1" / "Videos" / "Walking 1.54138969.mp4"
+    video.with_name("Sitting.mp4").write_bytes(video.read_bytes())
+    with pytest.raises(AnnotationError, match=r"wanted is \(F, 64\)"):
+        read_human36m(human36m)
+    np.savez(folder / "Sitting.npz", Pose=np.zeros((500, 64)) + 50)
+    with pytest.raises(AnnotationError, match="can be read up to frame 30"):
+        read_human36m(human36m)
+    video.with_name("Sitting.mp4").unlink()
+    with pytest.raises(AnnotationError, match=r"Sitting\.mp4 is missing"):
+        read_human36m(human36m)
