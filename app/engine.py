@@ -19,6 +19,7 @@ from library_store.errors import LibraryError
 from library_store.library import Library
 from library_store.library import load as load_library
 from library_store.manifest import read_manifest
+from library_store.milvus import MilvusSettings
 from models import ModelCard, ModelError, PersonDetector, PoseEstimator
 from models.choice import choose
 
@@ -113,9 +114,21 @@ def reload_engine(engine: Engine, settings: Settings) -> Engine | None:
 
 def _open_library(directory: Path, settings: Settings) -> Library:
     try:
-        return load_library(directory, exact_index=settings.exact_index)
+        return load_library(directory, backend=settings.index, milvus=milvus_of(settings))
     except LibraryError as error:
         raise StartupError(str(error)) from error
+
+
+def milvus_of(settings: Settings) -> MilvusSettings | None:
+    """Where Milvus is, if the settings say so."""
+    if settings.milvus_uri is None:
+        return None
+    token = settings.milvus_token
+    return MilvusSettings(
+        uri=settings.milvus_uri,
+        token=token.get_secret_value() if token else "",
+        timeout_s=settings.milvus_timeout_ms / 1e3,
+    )
 
 
 def _assemble(

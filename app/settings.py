@@ -12,6 +12,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from app import MAX_DECODABLE_PIXELS
 from app.errors import StartupError
+from library_store.backends import Backend
 from models import ProviderChoice
 
 ENV_PREFIX = "POSEMATCH_"
@@ -108,8 +109,21 @@ class Settings(BaseSettings):
     library_dir: Path | None = Field(
         None, description="A built library to serve instead of the default one."
     )
-    exact_index: bool = Field(
-        False, description="Search the library exhaustively instead of with its HNSW index."
+    index: Backend = Field(
+        "auto",
+        description="What finds neighbours: cells (of every library), exact (every exemplar "
+        "compared), hnsw (where the library was built with it) or milvus; auto is the one that "
+        "the library was built for.",
+    )
+    milvus_uri: str | None = Field(
+        None, min_length=1, description="Where Milvus is, as http://host:19530."
+    )
+    milvus_token: SecretStr | None = Field(None, description="Milvus's API key, or user:password.")
+    milvus_timeout_ms: float = Field(
+        1000.0,
+        gt=0,
+        le=60_000,
+        description="Longest time a search in Milvus may take, retries included; then a 503.",
     )
     shortlist: int = Field(
         30, ge=1, le=1000, description="Exemplars per person that are resectioned (eq. 4's k)."
@@ -175,6 +189,8 @@ class Settings(BaseSettings):
 
     @model_validator(mode="after")
     def _fit_together(self) -> Self:
+        if self.index == "milvus" and self.milvus_uri is None:
+            raise ValueError("index=milvus needs milvus_uri")
         if self.quota_per_minute is not None and not self.api_keys:
             raise ValueError("quota_per_minute counts per API key: set api_keys too")
         if self.max_batch_body_bytes < self.max_body_bytes:

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from library_store.backends import DESCRIPTORS_FILE, IndexSettings
+from library_store.backends import write_index as write_index_files
 from library_store.cameras import COLUMNS, project, sample_cameras
 from library_store.descriptor import DIMENSIONS, describe
-from library_store.index import HnswIndex, HnswSettings
-from library_store.library import INDEX_FILE
 from library_store.manifest import (
     CONTENT_FILES,
     MANIFEST,
@@ -42,7 +42,7 @@ from library_store.tables import TableWriter, open_table
 Report = Callable[[str, float], None]
 
 POSES_FILE, CAMERAS_FILE = "poses.npy", "cameras.npy"
-PROJECTIONS_FILE, DESCRIPTORS_FILE = "projections.npy", "descriptors.npy"
+PROJECTIONS_FILE = "projections.npy"
 
 _VIEWS = "views.npy"
 _POSE_GRID_MM = 0.01
@@ -110,18 +110,18 @@ def write_descriptors(steps: Steps, workshop: Path, seed: int, report: Report) -
     return steps.run("descriptors", work, CAMERAS_FILE, PROJECTIONS_FILE, DESCRIPTORS_FILE)
 
 
-def write_index(steps: Steps, workshop: Path, settings: HnswSettings, report: Report) -> Facts:
+def write_index(steps: Steps, workshop: Path, settings: IndexSettings, report: Report) -> Facts:
     """Build the nearest-neighbour index over the descriptors."""
 
     def work() -> Facts:
         descriptors: NDArray[np.float32] = open_table(workshop / DESCRIPTORS_FILE).astype(
             np.float32, copy=False
         )
-        index = HnswIndex.build(descriptors, settings, lambda done: report("index", done))
-        index.save(workshop / INDEX_FILE)
-        return settings.describe()
+        return write_index_files(
+            workshop, descriptors, settings, lambda done: report("index", done)
+        )
 
-    return steps.run("index", work, INDEX_FILE)
+    return steps.run("index", work, *settings.files)
 
 
 def write_manifest(
@@ -141,7 +141,7 @@ def write_manifest(
     ``counts`` has ``n_poses``, ``n_cameras`` and ``n_exemplars``.
     """
     report("checksums", 0.0)
-    files = {name: file_sum(workshop / name) for name in (*CONTENT_FILES, INDEX_FILE)}
+    files = {name: file_sum(workshop / name) for name in (*CONTENT_FILES, *index["files"])}
     manifest = Manifest(
         name=name,
         version=version,

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from library_store.assemble import write_descriptors, write_index, write_manifest, write_poses
+from library_store.backends import IndexSettings
 from library_store.cameras import COLUMNS, DISTANCE_RANGE_MM
 from library_store.errors import LibraryError
-from library_store.index import HnswSettings
 from library_store.manifest import FORMAT, Licence, Manifest, check_files, file_sum, read_manifest
 from library_store.mocap import MocapSettings, gather
 from library_store.prior import DEFAULT_PRIOR, PosePrior
@@ -37,7 +37,7 @@ Progress = Callable[[str, float], None]
 RECIPE = 2
 """Raised whenever the code would build another library from the same parameters."""
 
-BYTES_PER_EXEMPLAR = 600
+BYTES_PER_EXEMPLAR = 450
 """About what an exemplar takes on the disk, its share of the index included."""
 
 
@@ -55,7 +55,7 @@ class BuildSettings:
     n_poses: int = 200_000
     cameras_per_pose: int = 1
     seed: int = 0
-    index: HnswSettings = field(default_factory=HnswSettings)
+    index: IndexSettings = field(default_factory=IndexSettings)
     version: str = ""
 
     def __post_init__(self) -> None:

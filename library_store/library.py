@@ -16,11 +16,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from library_store import cameras as camera_geometry
-from library_store.descriptor import DIMENSIONS, describe
+from library_store.backends import (
+    DESCRIPTORS_FILE,
+    Backend,
+    needed_files,
+    open_index,
+    resolve,
+)
+from library_store.descriptor import describe
 from library_store.errors import LibraryError
-from library_store.index import ExactIndex, HnswIndex, Index
 from library_store.manifest import MEND, Licence, Manifest, check_files, read_manifest
-from library_store.masked import MaskedSearch
+from library_store.milvus import MilvusSettings
 from library_store.sources import (
     FRAMES_FILE,
     PARTS_FILE,
@@ -34,8 +40,6 @@ from library_store.tables import open_table
 
 Float = NDArray[np.float64]
 Entries = NDArray[np.int64]
-
-INDEX_FILE = "index.hnsw"
 
 
 @dataclass(frozen=True)
@@ -55,38 +59,49 @@ class Library:
     Made by :func:`load`. ``manifest`` says what it is.
     """
 
-    def __init__(self, directory: Path, manifest: Manifest, *, exact_index: bool) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        manifest: Manifest,
+        backend: Backend,
+        milvus: MilvusSettings | None,
+    ) -> None:
         self.directory = directory
         self.manifest = manifest
 
         self._poses = open_table(directory / "poses.npy")
         self._cameras = open_table(directory / "cameras.npy")
         self._projections = open_table(directory / "projections.npy")
-        self._descriptors: NDArray[np.float32] = open_table(directory / "descriptors.npy").astype(
-            np.float32, copy=False
-        )
+        self._descriptors: NDArray[np.float32] | None = None
+        if DESCRIPTORS_FILE in needed_files(backend):
+            self._descriptors = open_table(directory / DESCRIPTORS_FILE).astype(
+                np.float32, copy=False
+            )
         self.sources = read_sources(
             directory / SOURCES_FILE,
             open_table(directory / FRAMES_FILE).astype(np.int32, copy=False),
             open_table(directory / PARTS_FILE).astype(np.int32, copy=False),
         )
         self._check_shapes()
-        self._index: Index
-        if exact_index or manifest.index["backend"] == ExactIndex.backend:
-            self._index = ExactIndex(self._descriptors)
-        else:
-            self._index = HnswIndex.load(directory / INDEX_FILE, self._descriptors)
-        self._masked = MaskedSearch(self._descriptors)
+        self._index = open_index(
+            backend,
+            directory,
+            manifest,
+            descriptors=self._descriptors,
+            describe=self._described,
+            milvus=milvus,
+        )
 
     def _check_shapes(self) -> None:
         counts = self.manifest
-        expected = {
+        expected: dict[str, tuple[NDArray[np.generic], tuple[int, ...]]] = {
             "poses.npy": (self._poses, (counts.n_poses, 14, 3)),
             FRAMES_FILE: (self.sources.frames, (counts.n_poses,)),
             "cameras.npy": (self._cameras, (counts.n_cameras, 4)),
             "projections.npy": (self._projections, (counts.n_exemplars, 2)),
-            "descriptors.npy": (self._descriptors, (counts.n_exemplars, 28)),
         }
+        if self._descriptors is not None:
+            expected[DESCRIPTORS_FILE] = (self._descriptors, (counts.n_exemplars, 28))
         for name, (array, shape) in expected.items():
             if array.shape != shape:
                 raise LibraryError(
@@ -99,7 +114,7 @@ class Library:
 
     @property
     def index_backend(self) -> str:
-        """Which nearest-neighbour index answers: ``hnsw`` or ``exact``."""
+        """Which nearest-neighbour index answers: :mod:`library_store.backends`."""
         return self._index.backend
 
     def poses_mm(self, entries: ArrayLike) -> Float:
@@ -122,7 +137,13 @@ class Library:
 
     def descriptors(self, entries: ArrayLike) -> NDArray[np.float32]:
         """Descriptors of entries (...): (..., 28) float32."""
-        return self._descriptors[np.asarray(entries, dtype=np.int64)]
+        chosen = np.asarray(entries, dtype=np.int64)
+        return self._described(chosen) if self._descriptors is None else self._descriptors[chosen]
+
+    def _described(self, entries: Entries) -> NDArray[np.float32]:
+        """Descriptors of entries (...), as the build made them: from poses and cameras."""
+        rows = self._cameras[self._projections[entries, 1]]
+        return describe(camera_geometry.project(rows, self.poses_mm(entries)))
 
     def match(self, points: ArrayLike, weights: ArrayLike | None, k: int) -> Matches:
         """The k exemplars whose projections are nearest to 2D poses (eq. 4's shortlist).
@@ -130,7 +151,8 @@ class Library:
         ``points``: (Q, 14, 2) in any unit, scale and position; ``weights``: (Q, 14) in [0, 1], 0
         for a missing joint (whose coordinates are not read), ``None`` for all 1. Returns
         ``min(k, len)`` entries per query. Raises ``ValueError`` for a query whose joints of
-        positive weight are fewer than two or coincide.
+        positive weight are fewer than two or coincide, ``IndexUnavailableError`` while the index's
+        engine is away.
         """
         points = np.asarray(points, dtype=np.float64)
         if k < 1:
@@ -143,9 +165,9 @@ class Library:
         if complete.any():
             found = self._index.query(describe(points[complete]), k)
             entries[complete], distances[complete] = found.entries, found.distances
-        for row in np.flatnonzero(~complete):
-            masked = self._masked.query(points[row], shares[row], k)
-            entries[row], distances[row] = masked.entries, masked.distances
+        if not complete.all():
+            found = self._index.query_masked(points[~complete], shares[~complete], k)
+            entries[~complete], distances[~complete] = found.entries, found.distances
         return Matches(entries=entries, distances=distances)
 
     def source(self, entry: int) -> Source:
@@ -191,21 +213,28 @@ class Library:
         self._poses = self._cameras = self._projections = empty
         self.sources = Sources((), (), empty.astype(np.int32), empty.astype(np.int32))
         self._descriptors = empty
-        self._index = ExactIndex(empty)
-        self._masked = MaskedSearch(empty.reshape(0, DIMENSIONS))
+        self._index.close()
 
 
-def load(directory: Path, *, verify: bool = True, exact_index: bool = False) -> Library:
+def load(
+    directory: Path,
+    *,
+    verify: bool = True,
+    backend: Backend = "auto",
+    milvus: MilvusSettings | None = None,
+) -> Library:
     """Open the library in ``directory``.
 
-    ``verify`` checks the SHA-256 of every file (a quarter of a second for 200,000 exemplars);
-    presence, size and shape are always checked. ``exact_index`` searches by brute force instead of
-    the library's index. Raises ``LibraryError``, naming the file and the way to mend it.
+    ``verify`` checks the SHA-256 of every file that is needed (a quarter of a second for 200,000
+    exemplars); presence, size and shape are always checked. ``backend`` chooses the index
+    (:mod:`library_store.backends`), ``milvus`` says where that one is. Raises ``LibraryError``,
+    naming the file and the way to mend it.
     """
     manifest = read_manifest(directory)
-    check_files(directory, manifest, sums=verify)
+    backend = resolve(backend, manifest)
+    check_files(directory, manifest, sums=verify, names=needed_files(backend))
     try:
-        return Library(directory, manifest, exact_index=exact_index)
+        return Library(directory, manifest, backend, milvus)
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise LibraryError(
             f"{directory} cannot be opened ({error}); " + MEND.format(directory=directory)

@@ -10,21 +10,21 @@ A library is a directory of
 - ``cameras.npy``     (C, 4) float32, :mod:`library_store.cameras`;
 - ``projections.npy`` (E, 2) int32, pose and camera of each exemplar, ascending;
 - ``descriptors.npy`` (E, 28) float32, :mod:`library_store.descriptor`;
-- ``index.*``         the nearest-neighbour index, :mod:`library_store.index`.
+- ``index.*``         the nearest-neighbour index, :mod:`library_store.backends`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from library_store.errors import LibraryError
 
-FORMAT = 2
+FORMAT = 3
 MANIFEST = "manifest.json"
 CONTENT_FILES = (
     "poses.npy",
@@ -66,8 +66,8 @@ class Manifest:
 
     ``sha256`` identifies the content: it is taken over the names and sums of the content files, not
     of the index, so that two builds of the same library carry the same one. ``build`` holds the
-    parameters the library was built with, ``index`` those of the index, with ``reproducible``
-    saying whether another build would give the same index file.
+    parameters the library was built with, ``index`` the backend it was built for, its files and
+    parameters.
     """
 
     name: str
@@ -119,8 +119,13 @@ def read_manifest(directory: Path) -> Manifest:
     except (OSError, ValueError) as error:
         raise LibraryError(f"{path} cannot be read ({error}); {mend}") from error
     try:
-        if content.pop("format") != FORMAT:
-            raise LibraryError(f"{path} is of another format than {FORMAT}; {mend}")
+        written = content.pop("format")
+        if written != FORMAT:
+            raise LibraryError(
+                f"{path} was written by another version of posematch (format {written}, this one "
+                f"reads {FORMAT}): build the library again with `posematch library build`, from "
+                "the same inputs; ids and poses stay the same"
+            )
         content["licences"] = tuple(Licence(**licence) for licence in content["licences"])
         content["files"] = {name: FileSum(**total) for name, total in content["files"].items()}
         manifest = Manifest(**content)
@@ -134,11 +139,17 @@ def read_manifest(directory: Path) -> Manifest:
     return manifest
 
 
-def check_files(directory: Path, manifest: Manifest, *, sums: bool) -> None:
-    """Check presence, size and, with ``sums``, SHA-256 of every file; ``LibraryError`` if wrong."""
+def check_files(
+    directory: Path, manifest: Manifest, *, sums: bool, names: Collection[str] | None = None
+) -> None:
+    """Check presence, size and, with ``sums``, SHA-256 of every file; ``LibraryError`` if wrong.
+
+    ``names``: only these files.
+    """
     mend = MEND.format(directory=directory)
-    for name, expected in manifest.files.items():
+    for name in manifest.files if names is None else names:
         path = directory / name
+        expected = manifest.files[name]
         try:
             size = path.stat().st_size
             if size != expected.bytes:

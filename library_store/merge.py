@@ -19,17 +19,16 @@ import numpy as np
 
 from library_store.assemble import (
     CAMERAS_FILE,
-    DESCRIPTORS_FILE,
     POSES_FILE,
     PROJECTIONS_FILE,
     Report,
     write_index,
     write_manifest,
 )
+from library_store.backends import DESCRIPTORS_FILE, IndexSettings
 from library_store.cameras import COLUMNS
 from library_store.descriptor import DIMENSIONS
 from library_store.errors import LibraryError
-from library_store.index import HnswSettings
 from library_store.manifest import FORMAT, Licence, Manifest, check_files, read_manifest
 from library_store.publish import locked, replacing
 from library_store.sources import (
@@ -66,7 +65,7 @@ def merge_libraries(
     *,
     name: str,
     version: str = "1",
-    index: HnswSettings | None = None,
+    index: IndexSettings | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Manifest:
     """Merge the libraries in ``parts`` into one at ``directory``, replacing what is there.
@@ -78,7 +77,7 @@ def merge_libraries(
     if not NAME_PATTERN.fullmatch(name):
         raise ValueError(f"library name {name!r} must match {NAME_PATTERN.pattern}")
     report = progress or (lambda _stage, _fraction: None)
-    settings = index or HnswSettings()
+    settings = index or IndexSettings()
     manifests = []
     for number, part in enumerate(parts):
         manifests.append(read_manifest(part))

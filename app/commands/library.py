@@ -15,6 +15,7 @@ from rich.table import Table
 
 from app.commands.console import build_if_missing, notices, output, stage_progress
 from app.settings import load_settings
+from library_store.backends import IndexSettings
 from library_store.build import (
     BuildSettings,
     Mocap,
@@ -22,6 +23,7 @@ from library_store.build import (
     describe_library,
     verify_library,
 )
+from library_store.hnsw import HnswSettings
 from library_store.importers import Clip, read_each, states_licence, write_npz
 from library_store.library import load
 from library_store.manifest import Manifest
@@ -38,6 +40,10 @@ DEFAULT_SIZE = 200_000
 LibraryArgument = Annotated[
     Path | None,
     typer.Argument(help="A library; default POSEMATCH_LIBRARY_DIR, else the cached default one."),
+]
+
+HnswOption = Annotated[
+    bool, typer.Option("--hnsw", help="Index with an HNSW graph (extra `hnsw`), not cells alone.")
 ]
 
 
@@ -86,6 +92,7 @@ def build(
     name: Annotated[str, typer.Option(help="In exemplar ids; default the directory's.")] = "",
     version: Annotated[str, typer.Option(help="Default the prior's, or 1.")] = "",
     seed: Annotated[int, typer.Option(min=0, help="Another seed gives other poses.")] = 0,
+    hnsw: HnswOption = False,
 ) -> None:
     """Build a library from clips, from a pose prior or both.
 
@@ -108,6 +115,7 @@ def build(
             cameras_per_pose=cameras_per_pose,
             seed=seed,
             version=version,
+            index=_index(hnsw),
         )
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--name") from error
@@ -142,6 +150,10 @@ def _prior(choice: str | None, mocap: Mocap | None) -> PosePrior | None:
     return PosePrior.load(DEFAULT_PRIOR if choice == "default" else Path(choice))
 
 
+def _index(hnsw: bool) -> IndexSettings:
+    return IndexSettings(hnsw=HnswSettings() if hnsw else None)
+
+
 def _ask_for_licence(files: list[Path]) -> str:
     """What somebody at a terminal says about files that state no licence."""
     unstated = [file.name for file in files if not states_licence(file)]
@@ -159,6 +171,7 @@ def merge(
     directory: Annotated[Path, typer.Option(help="Write the merged library here.")],
     name: Annotated[str, typer.Option(help="In exemplar ids; default the directory's.")] = "",
     version: Annotated[str, typer.Option(help="The new library's.")] = "1",
+    hnsw: HnswOption = False,
 ) -> None:
     """Make one library of several, without building their parts anew."""
     try:
@@ -168,6 +181,7 @@ def merge(
                 libraries,
                 name=name or directory.name,
                 version=version,
+                index=_index(hnsw),
                 progress=report,
             )
     except ValueError as error:
@@ -246,7 +260,7 @@ def sample(
     if kind and chosen is None:
         raise typer.BadParameter(", ".join(kinds), param_hint="--kind")
     directory = library or build_if_missing(load_settings())
-    opened = load(directory, verify=False, exact_index=True)
+    opened = load(directory, verify=False, backend="exact")
     entries = draw_entries(opened, count, chosen, seed)
     if not entries:
         raise typer.BadParameter(f"{directory} has no {kind} exemplars", param_hint="--kind")

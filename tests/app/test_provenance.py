@@ -9,7 +9,6 @@ import pytest
 
 from app.schemas import ExemplarAnswer, InfoAnswer
 from library_store.build import BuildSettings, Mocap, build_library
-from library_store.index import HnswSettings
 from library_store.library import Library, load
 from library_store.mocap import MocapSettings
 from library_store.prior import PosePrior
@@ -29,7 +28,7 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Library:
     build_library(
         folder / "own",
         PosePrior.load(),
-        BuildSettings(name="own", n_poses=600, index=HnswSettings(threads=1)),
+        BuildSettings(name="own", n_poses=600),
         mocap=Mocap(files, settings, prior_share=0.2),
     )
     return load(folder / "own")

@@ -16,14 +16,13 @@ import httpx
 import pytest
 
 from library_store.build import BuildSettings, build_library
-from library_store.index import HnswSettings
 from library_store.manifest import read_manifest
 from library_store.prior import PosePrior
 from library_store.publish import put_in_place
 from tests.app.server import Server
 
 EXAMPLE = Path(__file__).parents[2] / "app" / "examples" / "lift_request.json"
-SETTINGS = BuildSettings(name="own", n_poses=1_500, index=HnswSettings(threads=1))
+SETTINGS = BuildSettings(name="own", n_poses=1_500)
 
 
 @dataclass
@@ -99,7 +98,7 @@ def test_no_request_fails_while_the_library_changes(
     with clients(server.url, photo) as load:
         while len(load.statuses) < 6:
             time.sleep(0.01)
-        settings = BuildSettings(name="own", n_poses=900, seed=1, index=HnswSettings(threads=1))
+        settings = BuildSettings(name="own", n_poses=900, seed=1)
         new = build_library(tmp_path / "own", PosePrior.load(), settings).sha256
         assert served(server) == old, "nothing changes before the signal"
         for _ in range(3):  # a second and third signal during the reload do no harm

@@ -11,7 +11,6 @@ from evaluation import calibration, lifting
 from evaluation.calibration import Errors, fit_sigma
 from evaluation.protocols import load_lifting_set, one_corrupted, one_missing
 from library_store.build import BuildSettings, build_library
-from library_store.index import HnswSettings
 from library_store.prior import PosePrior
 
 
@@ -34,7 +33,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def library_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("library") / "tiny"
-    settings = BuildSettings(name="tiny", n_poses=2_000, seed=3, index=HnswSettings(threads=1))
+    settings = BuildSettings(name="tiny", n_poses=2_000, seed=3)
     build_library(directory, PosePrior.load(), settings)
     return directory
 

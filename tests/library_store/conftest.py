@@ -8,11 +8,10 @@ from pathlib import Path
 import pytest
 
 from library_store.build import BuildSettings, build_library
-from library_store.index import HnswSettings
 from library_store.library import Library, load
 from library_store.prior import PosePrior
 
-SMALL = BuildSettings(name="small", n_poses=4_000, seed=7, index=HnswSettings(threads=1))
+SMALL = BuildSettings(name="small", n_poses=4_000, seed=7)
 
 
 @pytest.fixture(scope="session")

@@ -15,6 +15,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from library_store import publish
+from library_store.backends import IndexSettings
 from library_store.build import (
     BuildSettings,
     build_key,
@@ -23,14 +24,14 @@ from library_store.build import (
     ensure_default_library,
     verify_library,
 )
+from library_store.cell_index import CELL_FILES, ROWS_FILE
 from library_store.errors import LibraryError
-from library_store.index import HnswSettings
-from library_store.library import INDEX_FILE, Library, load
+from library_store.library import Library, load
 from library_store.manifest import CONTENT_FILES, MANIFEST
 from library_store.prior import PosePrior
 from tests.library_store.conftest import SMALL
 
-TINY = BuildSettings(name="tiny", n_poses=300, index=HnswSettings(threads=1))
+TINY = BuildSettings(name="tiny", n_poses=300)
 
 BUILD_AND_STALL = """
 import sys, time
@@ -76,17 +77,17 @@ def test_two_builds_are_the_same_bytes(
 ) -> None:
     again = build_library(tmp_path / "again", prior, SMALL)
     assert again.sha256 == small.manifest.sha256
-    for name in (*CONTENT_FILES, INDEX_FILE, MANIFEST):
+    for name in (*CONTENT_FILES, *CELL_FILES, MANIFEST):
         assert (tmp_path / "again" / name).read_bytes() == (small_directory / name).read_bytes()
 
 
 def test_the_digest_is_of_the_content_not_of_the_index(
     prior: PosePrior, tiny: Path, tmp_path: Path
 ) -> None:
-    settings = replace(TINY, index=HnswSettings(links=8, threads=1))
+    settings = replace(TINY, index=IndexSettings(rows_per_cell=20))
     other = build_library(tmp_path / "other", prior, settings)
     same = describe_library(tiny)
-    assert other.files[INDEX_FILE] != same.files[INDEX_FILE]
+    assert other.files[ROWS_FILE] != same.files[ROWS_FILE]
     assert other.sha256 == same.sha256
     reseeded = build_library(tmp_path / "other", prior, replace(TINY, seed=1))
     assert reseeded.sha256 != same.sha256
@@ -216,7 +217,7 @@ def test_the_key_covers_everything_the_library_is_made_of(prior: PosePrior) -> N
         build_key(prior, replace(TINY, seed=1)),
         build_key(prior, replace(TINY, n_poses=301)),
         build_key(prior, replace(TINY, cameras_per_pose=2)),
-        build_key(prior, replace(TINY, index=HnswSettings(links=8))),
+        build_key(prior, replace(TINY, index=IndexSettings(rows_per_cell=20))),
     }
     assert len(keys) == 6
 
@@ -262,7 +263,7 @@ def empty(path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [truncate, flip_a_bit, remove, empty])
-@pytest.mark.parametrize("name", [*CONTENT_FILES, INDEX_FILE])
+@pytest.mark.parametrize("name", [*CONTENT_FILES, *CELL_FILES])
 def test_a_damaged_file_is_named(name: str, damage: Callable[[Path], None], tiny: Path) -> None:
     damage(tiny / name)
     with pytest.raises(LibraryError, match=rf"{name}.*delete the directory {tiny}"):

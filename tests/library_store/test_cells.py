@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from library_store.cells import partition
+from library_store.cells import Cells, partition
+from library_store.errors import LibraryError
 
 
 @pytest.fixture(scope="module")
@@ -12,23 +15,57 @@ def table() -> np.ndarray:
     rng = np.random.default_rng(3)
     middles = rng.normal(size=(40, 28)) * 3.0
     rows = middles[rng.integers(0, 40, 5_000)] + rng.normal(size=(5_000, 28))
-    return rows.astype(np.float32)
+    rows *= np.sqrt(14.0) / np.linalg.norm(rows, axis=1, keepdims=True)
+    table: np.ndarray = rows.astype(np.float32)
+    return table
 
 
-def test_every_row_is_in_one_cell(table: np.ndarray) -> None:
+def test_every_row_is_in_one_cell_and_every_cell_in_one_group(table: np.ndarray) -> None:
     cells = partition(table, 50)
     assert_array_equal(np.sort(cells.entries), np.arange(len(table)))
-    assert_array_equal(cells.rows, table[cells.entries])
     assert cells.sizes.sum() == len(table)
     assert len(cells.centres) == len(cells.sizes)
     assert 50 <= len(cells.sizes) <= 200
+    assert cells.group_starts[0] == 0
+    assert cells.group_starts[-1] == len(cells.centres)
+    assert len(cells.group_starts) == len(cells.group_centres) + 1
 
 
 def test_cells_hold_near_rows(table: np.ndarray) -> None:
     cells = partition(table, 50)
     own = np.repeat(cells.centres, cells.sizes, axis=0)
-    within = ((cells.rows - own) ** 2).sum(1).mean()
-    assert within < 0.2 * table.var(axis=0).sum()
+    within = ((table[cells.entries] - own) ** 2).sum(1).mean()
+    assert within < 0.3 * table.var(axis=0).sum()
+
+
+def test_centres_are_as_long_as_rows(table: np.ndarray) -> None:
+    cells = partition(table, 50)
+    for centres in (cells.centres, cells.group_centres):
+        np.testing.assert_allclose(np.linalg.norm(centres, axis=1), np.sqrt(14.0), rtol=1e-5)
+
+
+@pytest.mark.parametrize("n_rows", [1, 100, 1_000, 5_000, 10_000])
+def test_the_nearest_cells_hold_as_many_rows_as_wanted(n_rows: int, table: np.ndarray) -> None:
+    cells = partition(table, 50)
+    near = cells.near(lambda rows: rows @ table[17], n_rows)
+    assert np.all(np.diff(near) > 0)
+    held = cells.sizes[near].sum()
+    assert held >= min(n_rows, len(table))
+    assert held - cells.sizes.max() < n_rows
+
+
+def test_few_groups_are_looked_into_for_few_rows(table: np.ndarray) -> None:
+    cells = partition(table, 50)
+    seen: list[int] = []
+
+    def similarity(rows: np.ndarray) -> np.ndarray:
+        seen.append(len(rows))
+        similar: np.ndarray = rows @ table[17]
+        return similar
+
+    cells.near(similarity, 20)
+    assert seen[0] == len(cells.group_centres)
+    assert seen[1] < len(cells.centres) / 2
 
 
 def test_the_same_table_gives_the_same_cells(table: np.ndarray) -> None:
@@ -37,8 +74,24 @@ def test_the_same_table_gives_the_same_cells(table: np.ndarray) -> None:
     assert_array_equal(first.starts, second.starts)
 
 
+def test_progress_ends(table: np.ndarray) -> None:
+    heard: list[float] = []
+    partition(table, 50, heard.append)
+    assert heard == sorted(heard)
+    assert heard[-1] == 1.0
+
+
+def test_there_and_back(table: np.ndarray, tmp_path: Path) -> None:
+    cells = partition(table, 50)
+    cells.save(tmp_path / "cells.npz")
+    again = Cells.load(tmp_path / "cells.npz", cells.entries)
+    assert_array_equal(again.starts, cells.starts)
+    assert_array_equal(again.centres, cells.centres)
+    with pytest.raises(LibraryError, match="does not partition 7 entries"):
+        Cells.load(tmp_path / "cells.npz", cells.entries[:7])
+
+
 @pytest.mark.parametrize("n", [0, 1, 7])
 def test_tables_smaller_than_a_cell(n: int) -> None:
-    table = np.ones((n, 28), dtype=np.float32)
-    cells = partition(table, 50)
-    assert len(cells.rows) == cells.sizes.sum() == n
+    cells = partition(np.ones((n, 28), dtype=np.float32), 50)
+    assert cells.sizes.sum() == len(cells.entries) == n

@@ -126,12 +126,12 @@ def test_the_manifest_says_what_the_library_is(small: Library, prior: PosePrior)
     assert manifest.build["seed"] == 7
     assert manifest.build["prior"]["sha256"] == prior.sha256
     assert manifest.licences[0].credit.startswith("The data used in this project")
-    assert json.loads(manifest.to_json())["format"] == 2
+    assert json.loads(manifest.to_json())["format"] == 3
 
 
 def test_the_exact_index_can_be_asked_for(small: Library, small_directory: Path) -> None:
-    exact = load(small_directory, exact_index=True)
-    assert (exact.index_backend, small.index_backend) == ("exact", "hnsw")
+    exact = load(small_directory, backend="exact")
+    assert (exact.index_backend, small.index_backend) == ("exact", "cells")
     points = projections(small, np.arange(0, 4000, 400))
     assert_array_equal(exact.match(points, None, 1).entries, small.match(points, None, 1).entries)
     exact.close()

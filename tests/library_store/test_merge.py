@@ -8,15 +8,12 @@ from numpy.testing import assert_array_equal
 
 from library_store.build import BuildSettings, Mocap, build_library, verify_library
 from library_store.errors import LibraryError
-from library_store.index import HnswSettings
 from library_store.library import Library, load
 from library_store.merge import merge_libraries
 from library_store.mocap import MocapSettings
 from library_store.prior import PosePrior
 from library_store.sheet import TILE_PX, contact_sheet, draw_entries
 from tests.library_store.clips import clip, write_clips
-
-ONE_THREAD = HnswSettings(threads=1)
 
 
 @pytest.fixture(scope="module")
@@ -26,9 +23,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory, prior: PosePrior) -> Path:
     for name, n_poses, licence in (("first", 300, "free"), ("second", 200, "research only")):
         file = write_clips(folder / f"{name}.npz", clip("walk", 80, n_poses, licence=licence))
         mocap = Mocap((file,), MocapSettings(radius_mm=0.0))
-        settings = BuildSettings(name=name, n_poses=n_poses, index=ONE_THREAD)
+        settings = BuildSettings(name=name, n_poses=n_poses)
         build_library(folder / name, None, settings, mocap=mocap)
-    settings = BuildSettings(name="third", n_poses=100, index=ONE_THREAD)
+    settings = BuildSettings(name="third", n_poses=100)
     build_library(folder / "third", prior, settings)
     return folder
 
@@ -46,7 +43,6 @@ def merged(folder: Path, parts: list[Library]) -> Library:
         [part.directory for part in parts],
         name="all",
         version="2",
-        index=ONE_THREAD,
         progress=lambda stage, _done: heard.append(stage),
     )
     assert list(dict.fromkeys(heard)) == ["checking", "joining", "index", "checksums"]
@@ -114,10 +110,10 @@ def test_ids_of_the_merged_library(merged: Library, parts: list[Library]) -> Non
 def test_a_merged_library_can_be_merged(
     merged: Library, parts: list[Library], prior: PosePrior, tmp_path: Path
 ) -> None:
-    settings = BuildSettings(name="more", n_poses=50, seed=9, index=ONE_THREAD)
+    settings = BuildSettings(name="more", n_poses=50, seed=9)
     build_library(tmp_path / "more", prior, settings)
     both = [merged.directory, tmp_path / "more"]
-    merge_libraries(tmp_path / "again", both, name="again", index=ONE_THREAD)
+    merge_libraries(tmp_path / "again", both, name="again")
     again = load(tmp_path / "again")
     assert len(again) == 650
     sampled = {again.source(entry).prior for entry in again.entries_of("sampled")}

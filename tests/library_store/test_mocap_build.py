@@ -19,7 +19,6 @@ from library_store.build import BuildSettings, Mocap, build_library, verify_libr
 from library_store.clean import face_ahead
 from library_store.errors import LibraryError
 from library_store.importers import MocapError, read
-from library_store.index import HnswSettings
 from library_store.library import Library, load
 from library_store.manifest import CONTENT_FILES, MANIFEST
 from library_store.mocap import MocapSettings
@@ -30,7 +29,7 @@ from library_store.sources import Source
 from library_store.steps import LEDGER
 from tests.library_store.clips import clip, write_clips
 
-SETTINGS = BuildSettings(name="own", n_poses=2_000, seed=3, index=HnswSettings(threads=1))
+SETTINGS = BuildSettings(name="own", n_poses=2_000, seed=3)
 EVERY_FRAME = MocapSettings(radius_mm=0.0)
 
 
@@ -204,14 +203,13 @@ BUILD = """
 import os, signal, sys
 from pathlib import Path
 from library_store.build import BuildSettings, Mocap, build_library
-from library_store.index import HnswSettings
 from library_store.mocap import MocapSettings
 
 def stall(stage, done):
     if stage == sys.argv[2]:
         os.kill(os.getpid(), signal.SIGKILL)
 
-settings = BuildSettings(name="own", n_poses=2_000, seed=3, index=HnswSettings(threads=1))
+settings = BuildSettings(name="own", n_poses=2_000, seed=3)
 mocap = Mocap(tuple(map(Path, sys.argv[3:])), MocapSettings(radius_mm=0.0))
 build_library(Path(sys.argv[1]), None, settings, stall, mocap=mocap)
 """

@@ -12,7 +12,6 @@ from app.lifting.geometry import Floats, project
 from app.lifting.lifter import Lifter
 from app.lifting.types import Intrinsics, LiftedPerson, Method, Observation
 from library_store.build import BuildSettings, build_library
-from library_store.index import HnswSettings
 from library_store.library import Library, load
 from library_store.prior import PosePrior
 
@@ -22,7 +21,7 @@ INTRINSICS = Intrinsics(1150.0, (320.0, 240.0), "request")
 @pytest.fixture(scope="session")
 def library(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Library]:
     directory = tmp_path_factory.mktemp("lifting") / "small"
-    settings = BuildSettings(name="small", n_poses=4_000, seed=11, index=HnswSettings(threads=1))
+    settings = BuildSettings(name="small", n_poses=4_000, seed=11)
     build_library(directory, PosePrior.load(), settings)
     library = load(directory)
     yield library
