@@ -63,7 +63,7 @@ class Attempts:
 
     def pause_after(self, response: httpx.Response) -> float | None:
         """How long to wait before the next try; None when this answer is the last word."""
-        if response.status_code not in RETRIED_STATUSES:
+        if response.status_code not in RETRIED_STATUSES and not _is_of_a_proxy(response):
             return None
         return self._pause(retry_after_s(response))
 
@@ -84,6 +84,15 @@ class Attempts:
             pause = asked_s + self._uniform(0.0, max(asked_s, 1.0) / 4)
         is_over = self._made >= self._retries.attempts or self._clock() + pause >= self._end_s
         return None if is_over else pause
+
+
+def _is_of_a_proxy(response: httpx.Response) -> bool:
+    """Whether this is a 500 not of the service's own making, whose errors are all problem+json.
+
+    Ray Serve's proxy answers so when the replica that had the request has died.
+    """
+    kind = response.headers.get("content-type", "")
+    return response.status_code == 500 and not kind.startswith("application/problem+json")
 
 
 def retry_after_s(response: httpx.Response) -> float | None:

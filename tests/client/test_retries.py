@@ -126,6 +126,14 @@ def test_a_proxy_without_a_problem(way: str) -> None:
         ask(Script(html), QUICK, way)
 
 
+@both_ways
+def test_a_proxy_that_lost_its_replica(way: str) -> None:
+    lost = httpx.Response(500, headers={"Content-Type": "text/plain"}, content="Internal error")
+    script = Script(lost, lost)
+    assert ask(script, QUICK, way) == {"people": []}
+    assert len(script.requests) == 3
+
+
 @given(
     asked=st.none() | st.integers(0, 400),
     spent_s=st.floats(0, 60),
