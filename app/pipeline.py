@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from app.errors import InvalidInputError
+from app.errors import InvalidInputError, LibraryUnavailableError
 from app.imaging import Photo, decode_photo
 from app.lifting.lifter import Lifter
 from app.lifting.types import (
@@ -26,6 +26,7 @@ from app.lifting.types import (
     NotLiftable,
     Observation,
 )
+from library_store.errors import IndexUnavailableError
 from models.heatmaps import Joints2D
 from models.person_detector import PersonBox
 from models.presence import present
@@ -215,7 +216,7 @@ class Pipeline:
         clock.lap("detect")
         joints = self._estimator.estimate(seen.pixels_bgr, boxes) if boxes else []
         if query.box_px is None:
-            kept = present(joints)
+            kept = present(boxes, joints)
             boxes, joints = [boxes[i] for i in kept], [joints[i] for i in kept]
         joints = [_to_image(found, seen) for found in joints]
         clock.lap("pose")
@@ -290,14 +291,17 @@ class Pipeline:
             return []
         for stage in ("match", "camera", "warp"):
             clock.timings_ms[stage] = 0.0  # in the order of the contract, whatever comes first
-        return self._lifter.lift(
-            observations,
-            intrinsics,
-            method=query.method,
-            subject_height_mm=query.subject_height_mm,
-            n_candidates=query.candidates,
-            lap=clock.lap,
-        )
+        try:
+            return self._lifter.lift(
+                observations,
+                intrinsics,
+                method=query.method,
+                subject_height_mm=query.subject_height_mm,
+                n_candidates=query.candidates,
+                lap=clock.lap,
+            )
+        except IndexUnavailableError as error:
+            raise LibraryUnavailableError(error.retry_after_s) from error
 
     def _boxes(self, seen: Photo, query: PhotoQuery) -> list[PersonBox]:
         """The people to look at, in the decoded photo's own pixels."""

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 
 from models.heatmaps import Joints2D
+from models.person_detector import PersonBox
 from models.presence import present
 
 
@@ -17,21 +18,33 @@ def person(shift_px: float = 0.0, confidence: float = 0.9) -> Joints2D:
     )
 
 
+def kept(people: list[Joints2D], score: float = 0.8) -> list[int]:
+    """What is left of people in boxes of that score."""
+    box = PersonBox(x_px=0.0, y_px=0.0, width_px=100.0, height_px=100.0, score=score)
+    return present([box] * len(people), people)
+
+
 def test_distinct_people_stay_in_order() -> None:
-    assert present([person(), person(80), person(160)]) == [0, 1, 2]
+    assert kept([person(), person(80), person(160)]) == [0, 1, 2]
 
 
 def test_the_same_pose_twice_is_one_person() -> None:
-    assert present([person(), person(3), person(80)]) == [0, 2]
+    assert kept([person(), person(3), person(80)]) == [0, 2]
 
 
 def test_somebody_cut_off_at_the_chest_is_somebody() -> None:
     confidence = np.full(14, 0.05)
     confidence[:5] = 0.9
-    assert present([replace(person(), confidence=confidence)]) == [0]
+    assert kept([replace(person(), confidence=confidence)]) == [0]
 
 
 def test_a_pose_that_nobody_believes_is_nobody() -> None:
-    assert present([person(confidence=0.05), person(80)]) == [1]
+    assert kept([person(confidence=0.05), person(80)]) == [1]
     unsure = replace(person(), confidence=None, peak=np.full(14, 0.05))
-    assert present([unsure]) == []
+    assert kept([unsure]) == []
+
+
+def test_either_network_may_doubt_but_not_both() -> None:
+    assert kept([person(confidence=0.9)], score=0.45) == [0]
+    assert kept([person(confidence=0.6)], score=0.8) == [0]
+    assert kept([person(confidence=0.67)], score=0.45) == [], "a raised forearm"
