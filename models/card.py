@@ -44,6 +44,7 @@ class PoseOutput(_Frozen):
     stride_px: float = Field(description="input pixels per heat map cell")
     target_sigma_cells: float = Field(description="blur of the training targets")
     maps: Literal["logits", "beliefs"]
+    border_grey: int = Field(0, ge=0, le=255, description="what crops have beyond the photo's edge")
     confidence: ConfidenceCalibration | None = None
     spread: SpreadCalibration | None = None
 

@@ -8,9 +8,13 @@ from numpy.typing import NDArray
 
 
 def square_crop(
-    image: NDArray[np.uint8], center_px: tuple[float, float], side_px: float, size: int
+    image: NDArray[np.uint8],
+    center_px: tuple[float, float],
+    side_px: float,
+    size: int,
+    border_grey: int = 0,
 ) -> tuple[NDArray[np.uint8], float, tuple[float, float]]:
-    """Square of ``side_px`` around ``center_px`` as (size, size, 3); black beyond the photo.
+    """Square of ``side_px`` around ``center_px`` as (size, size, 3); grey beyond the photo.
 
     Returns the crop, its pixels' size in the photo's pixels (``scale``) and the photo position of
     its pixel (0, 0) (``origin``): photo = origin + scale * crop, integers being pixel centres.
@@ -46,6 +50,10 @@ def square_crop(
         ]
     )
     crop = cv2.warpAffine(
-        source, matrix, (size, size), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        source,
+        matrix,
+        (size, size),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderValue=(border_grey,) * 3,
     )
     return np.asarray(crop, np.uint8), scale, origin

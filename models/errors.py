@@ -7,3 +7,7 @@ class ModelError(Exception):
 
 class AnnotationError(ModelError):
     """A user's labelled images cannot be trained on; names the file, the record and the mend."""
+
+
+class CaffeError(ModelError):
+    """A prototxt or caffemodel is not one, or not of a network that can be imported."""

@@ -65,7 +65,7 @@ class PoseEstimator:
         for box in boxes:
             center = (box.x_px + box.width_px / 2, box.y_px + box.height_px / 2)
             side = max(box.width_px, box.height_px, 1.0) * self._output.crop_scale
-            crop, scale, origin = square_crop(image, center, side, size)
+            crop, scale, origin = square_crop(image, center, side, size, self._output.border_grey)
             crops.append(crop)
             scales.append(scale)
             origins.append(origin)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +16,8 @@ from app.engine import chosen_networks
 from app.errors import StartupError
 from app.settings import Settings, load_settings
 from models import ModelCard, ModelError, ProviderChoice
+from models.caffe import LICENCE, JointOrder
+from models.caffe import import_caffe as import_network
 from models.card import read_card, write_card
 from models.choice import cards_of
 from models.cost import cpu_ms
@@ -124,8 +127,7 @@ def export(
 ) -> None:
     """Make a training run's checkpoint into an ONNX file and its card.
 
-    Serve it with POSEMATCH_WEIGHTS_DIR=OUT POSEMATCH_MODEL=NAME (the person network's files have to
-    lie there too).
+    Serve it with POSEMATCH_WEIGHTS_DIR=OUT POSEMATCH_MODEL=NAME.
     """
     if kind not in {"cpm", "person"}:
         raise typer.BadParameter("cpm or person", param_hint="--kind")
@@ -139,6 +141,7 @@ def export(
             checkpoint, out, network, version=version, name=name, size_px=input_px
         )
         OnnxModel(out, card.name)
+        _complete(out, load_settings().weights_dir)
     except ModelError as error:
         raise StartupError(str(error)) from error
     output.print(f"{out / card.file}, {card.name}.json", highlight=False, markup=False)
@@ -208,6 +211,7 @@ def finetune(
                 threads=threads,
             ),
         )
+        _complete(out, settings.weights_dir)
     except ModelError as error:
         raise StartupError(str(error)) from error
     table = Table(title=f"{result.n_trained} people trained on, {result.n_held_out} held out")
@@ -217,6 +221,51 @@ def finetune(
     table.add_row(f"after ({escape(name)})", f"{100 * result.after:.1f}")
     output.print(table)
     output.print(f"{out / result.card.file}", highlight=False, markup=False, soft_wrap=True)
+
+
+@commands.command("import-caffe")
+def import_caffe(
+    prototxt: Annotated[
+        Path, typer.Argument(exists=True, dir_okay=False, help="pose_deploy_centerMap.prototxt.")
+    ],
+    caffemodel: Annotated[
+        Path, typer.Argument(exists=True, dir_okay=False, help="pose_iter_*.caffemodel.")
+    ],
+    out: Annotated[Path, typer.Option(help="Directory for the ONNX file and its card.")],
+    name: Annotated[str, typer.Option(help="Of the card.")] = "cpm-original",
+    joints: Annotated[
+        JointOrder,
+        typer.Option(help="Order of its maps: cpm as published, or that of LSP or MPII."),
+    ] = "cpm",
+    licence: Annotated[
+        str | None, typer.Option(help="Of the weights, for the card; default: non-commercial.")
+    ] = None,
+) -> None:
+    """Make the paper's own network from its published Caffe files; needs neither Caffe nor torch.
+
+    \b
+    posematch model import-caffe pose_deploy_centerMap.prototxt pose_iter_985000_addLEEDS.caffemodel --out original
+    POSEMATCH_WEIGHTS_DIR=original POSEMATCH_MODEL=cpm-original posematch serve
+    """  # noqa: D301, E501
+    settings = load_settings()
+    try:
+        card = import_network(
+            prototxt, caffemodel, out, name=name, joints=joints, licence=licence or LICENCE
+        )
+        _complete(out, settings.weights_dir)
+    except ModelError as error:
+        raise StartupError(str(error)) from error
+    output.print(_card_table(card))
+
+
+def _complete(directory: Path, source: Path) -> None:
+    """Copy the person networks beside a new pose network, so that the directory can be served."""
+    if directory.resolve() == source.resolve():
+        return
+    for card in cards_of(source, "people"):
+        for file in (card.file, f"{card.name}.json"):
+            if not (directory / file).exists():
+                shutil.copy(source / file, directory / file)
 
 
 def _needs_training(error: ModuleNotFoundError) -> Exception:

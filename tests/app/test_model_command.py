@@ -13,6 +13,7 @@ from typer.testing import CliRunner, Result
 from app.cli import cli
 from app.errors import StartupError
 from models.card import WEIGHTS_DIR, read_card
+from tests.models.caffe import caffe_files
 from tests.models.training import user_files
 
 
@@ -71,6 +72,33 @@ def test_check_refuses_a_file_that_is_not_its_cards(weights: Path) -> None:
 def test_finetune_wants_one_kind_of_labels(tmp_path: Path) -> None:
     for given in ([], ["--human36m", tmp_path, "--images", tmp_path], ["--images", tmp_path]):
         assert invoke("finetune", "--out", tmp_path / "out", *given).exit_code == 2
+
+
+def test_import_caffe_makes_a_directory_that_can_be_served(tmp_path: Path, weights: Path) -> None:
+    steps = caffe_files.vgg_like(divide=64, n_stages=2)
+    paths = caffe_files.write(tmp_path, steps, caffe_files.random_weights(steps), 64)
+    out = tmp_path / "original"
+    result = invoke("import-caffe", *paths, "--out", out)
+    assert result.exit_code == 0, result.exception
+    assert "non-commercial" in " ".join(result.stdout.split())
+    assert {p.name for p in out.iterdir()} == {
+        *("cpm-original.json", "cpm-original.onnx", "person.json", "person.onnx")
+    }
+    assert read_card(out / "person.json") == read_card(weights / "person.json")
+
+
+def test_import_caffe_says_what_is_wrong_with_the_files(tmp_path: Path) -> None:
+    (tmp_path / "deploy.prototxt").write_text("layer { type: 'Data' }")
+    (tmp_path / "pose.caffemodel").write_text("<html>404</html>")
+    result = invoke(
+        "import-caffe",
+        tmp_path / "deploy.prototxt",
+        tmp_path / "pose.caffemodel",
+        "--out",
+        tmp_path,
+    )
+    assert isinstance(result.exception, StartupError)
+    assert "pose.caffemodel is no caffemodel" in str(result.exception)
 
 
 @pytest.mark.parametrize("command", ["finetune", "export"])

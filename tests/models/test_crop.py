@@ -51,3 +51,9 @@ def test_a_box_outside_the_photo_gives_a_black_crop(center: tuple[float, float])
     crop, _, _ = square_crop(np.full((50, 50, 3), 200, np.uint8), center, 300, 32)
     assert crop.shape == (32, 32, 3)
     assert crop.max() == 0
+
+
+def test_beyond_the_photo_is_the_grey_asked_for() -> None:
+    crop, _, _ = square_crop(np.full((20, 20, 3), 200, np.uint8), (9.5, 9.5), 40, 40, 128)
+    assert (crop[:5] == 128).all()
+    assert (crop[15:25, 15:25] == 200).all()

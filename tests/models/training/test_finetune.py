@@ -11,6 +11,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
 from models import ModelError, PoseEstimator  # noqa: E402
+from models.card import WEIGHTS_DIR  # noqa: E402
 from models.errors import AnnotationError  # noqa: E402
 from models.person_detector import PersonBox  # noqa: E402
 from models.training import export  # noqa: E402
@@ -63,7 +64,7 @@ def test_what_cannot_be_trained_on_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="name an fp32 pose network"):
         finetune(
             crops,
-            weights_dir=export.WEIGHTS_DIR,
+            weights_dir=WEIGHTS_DIR,
             start="person",
             out=tmp_path / "out",
             name="ours",
