@@ -33,6 +33,7 @@ def evaluate(
     posematch evaluate
     posematch evaluate lifting --help
     posematch evaluate renders --data tests/data/renders
+    posematch evaluate paper --data DIR
     """  # noqa: D301
     programs = find_programs()
     if program is None:
@@ -53,7 +54,13 @@ def find_programs() -> dict[str, str]:
         return {}
     programs = {}
     for module in pkgutil.iter_modules(package.submodule_search_locations):
-        spec = module.module_finder.find_spec(f"{_PACKAGE}.{module.name}", None)
+        name = f"{_PACKAGE}.{module.name}"
+        spec = module.module_finder.find_spec(name, None)
+        if module.ispkg and spec is not None:
+            # A package is run by its __main__.
+            inside = pkgutil.iter_modules(spec.submodule_search_locations)
+            mains = [it for it in inside if it.name == "__main__"]
+            spec = mains[0].module_finder.find_spec(f"{name}.__main__", None) if mains else None
         source = _source(spec)
         if '__name__ == "__main__"' in source:
             lines = (ast.get_docstring(ast.parse(source)) or "").splitlines()

@@ -1,0 +1,62 @@
+"""Every table and figure of the paper, on a user's own data or on free mocap.
+
+    posematch evaluate paper --data DIR
+    posematch evaluate paper --data cmu --mocap cmu.npz [--cross-set set.npz] [--library DIR]
+
+``DIR`` holds Human3.6M, HumanEva-I or both, in the forms that users have them in (see
+``evaluation.paper.datasets``); what is not there is named and its tables are left out. Libraries
+are made of the training frames as the cameras saw them, as in the paper; ``--library`` and
+``--mlp`` add rows for a library of posematch's own and a network trained on it, which must not know
+the people they are measured on. Prints Markdown; ``--out`` keeps it, with the figures.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from evaluation.paper.runs import Options, run_cmu, run_users_data
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line: see the module."""
+    parser = argparse.ArgumentParser(
+        prog="posematch evaluate paper",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--data", required=True, help="a folder, or the word cmu")
+    add("--out", type=Path, default=Path("paper-tables"), help="report.md, figures, libraries")
+    add("--entries", type=int, default=200_000, help="training frames in a library; 0: all")
+    add("--views", type=int, default=5_000, help="test views a protocol, drawn; 0: all")
+    add("--curve-views", type=int, default=1_000, help="the same for figures 7 and 8")
+    add("--seed", type=int, default=0, help="of everything that is drawn")
+    add("--library", type=Path, help="a library of posematch's own, for further rows")
+    add("--mlp", type=Path, help="what evaluation.paper.mlp trained on it, for further rows")
+    add("--mocap", type=Path, help="with --data cmu: the generic npz of CMU's poses")
+    add("--cross-set", type=Path, help="with --data cmu: people of another set (lifting npz)")
+    add("--noise-px", type=float, default=10.0, help="with --data cmu: what stands for a network")
+    chosen = parser.parse_args(arguments)
+    options = Options(
+        out=chosen.out,
+        entries=chosen.entries or None,
+        views=chosen.views or None,
+        curve_views=chosen.curve_views or None,
+        seed=chosen.seed,
+        library=chosen.library,
+        mlp=chosen.mlp,
+    )
+    if chosen.data == "cmu":
+        if chosen.mocap is None:
+            parser.error("--data cmu needs --mocap")
+        run_cmu(chosen.mocap, chosen.cross_set, chosen.noise_px, options)
+        return
+    if not Path(chosen.data).is_dir():
+        parser.error(f"--data {chosen.data} is no folder")
+    run_users_data(Path(chosen.data), options)
+
+
+if __name__ == "__main__":
+    main()

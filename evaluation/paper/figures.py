@@ -1,0 +1,144 @@
+"""Figures of people: a failure (2), the warp (3), answers (4), methods side by side (5, 6).
+
+What is drawn: the 2D that was given, then novel views with the camera's frustum. Bones in colour
+are the answer, grey ones what it is compared with: the truth, or in figure 3 the exemplar before
+the warp.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from app.drawing.picture import Picture, Words
+from app.drawing.views import NOVEL_VIEWS, draw_novel_view, draw_overlay
+from app.imaging import Photo
+from app.lifting.geometry import Floats
+from app.lifting.lifter import Lifter
+from app.lifting.types import Intrinsics, LiftedPerson, Method
+from app.pipeline import PhotoResult, SeenPerson
+from evaluation.metrics import align, rigid_error_mm
+from evaluation.paper.study import TestSet
+from library_store.library import Library
+
+SIDE_PX = 420
+_GROUND = 236
+_MARGIN = 0.15
+
+
+@dataclass(frozen=True)
+class Shown:
+    """One person of a figure: row of the test set, 2D source, method."""
+
+    row: int
+    source: str
+    method: Method
+
+
+def failure(test: TestSet, source: str, library: Library) -> Picture:
+    """Figure 2: the 19th worst of 20 people by the default method (the worst are freaks)."""
+    row = _at_share(test, source, library, 0.95)
+    return _line(test, library, Shown(row, source, "fusion"), "default method, against the truth")
+
+
+def warp(test: TestSet, library: Library) -> Picture:
+    """Figure 3: a person whose exemplar is helped by the warp as much as most."""
+    row = _at_share(test, "gt", library, 0.5)
+    shown = Shown(row, "gt", "paper")
+    return _line(test, library, shown, "X* (colour) and the exemplar X (grey)", before=True)
+
+
+def typical(test: TestSet, source: str, library: Library) -> list[Picture]:
+    """Figure 4: people at a quarter, half and three quarters of the errors."""
+    return [
+        _line(
+            test,
+            library,
+            Shown(_at_share(test, source, library, share), source, "fusion"),
+            f"default method, better than {1 - share:.0%} of the errors",
+        )
+        for share in (0.25, 0.5, 0.75)
+    ]
+
+
+def side_by_side(test: TestSet, source: str, library: Library) -> list[Picture]:
+    """Figures 5 and 6: the paper's method and the default one on the same 2D."""
+    row = _at_share(test, source, library, 0.6)
+    return [
+        _line(test, library, Shown(row, source, method), f"{method}, given {source}")
+        for method in ("paper", "fusion")
+    ]
+
+
+def _at_share(test: TestSet, source: str, library: Library, share: float) -> int:
+    """The person at this share of the default method's errors, of at most 200 people."""
+    rows = np.arange(len(test.views))[:: max(1, len(test.views) // 200)]
+    errors = [
+        float(
+            rigid_error_mm(
+                _lift(test, library, Shown(int(row), source, "fusion")).joints_3d_mm,
+                test.views.joints_mm[row],
+            ).mean()
+        )
+        for row in rows
+    ]
+    return int(rows[np.argsort(errors)[min(int(share * len(rows)), len(rows) - 1)]])
+
+
+def _lift(test: TestSet, library: Library, shown: Shown) -> LiftedPerson:
+    camera = test.views.camera_of(shown.row)
+    person = test.seen[shown.source].observation(shown.row, plain=shown.method == "paper")
+    (lifted,) = Lifter(library).lift([person], camera.intrinsics, method=shown.method)
+    if not isinstance(lifted, LiftedPerson):
+        raise RuntimeError(f"person {shown.row} cannot be lifted: {lifted.reason}")
+    return lifted
+
+
+def _line(
+    test: TestSet, library: Library, shown: Shown, title: str, *, before: bool = False
+) -> Picture:
+    """The 2D and two novel views of one person, side by side."""
+    person = _lift(test, library, shown)
+    truth = test.views.joints_mm[shown.row]
+    answer = person.joints_3d_mm
+    error = float(rigid_error_mm(answer, truth).mean())
+    other = person.exemplar.joints_mm if before else align(truth, answer, scale=False)
+    person = replace(person, exemplar=replace(person.exemplar, joints_mm=other))
+    points = test.seen[shown.source].points_px[shown.row]
+    result = _as_result(points, test.views.camera_of(shown.row).intrinsics, person)
+    canvas = np.full((result.height_px, result.width_px, 3), _GROUND, np.uint8)
+    photo = Photo(canvas, result.width_px, result.height_px, 1, 1, (0.0, 0.0), None)
+    picture = draw_overlay(photo, result.people, height_px=SIDE_PX)
+    words = Words(f"P1 {error:.0f} mm", np.array([10.0, 22.0]), (30, 28, 25), 14)
+    said = Words(title, np.array([10.0, SIDE_PX - 12.0]), (30, 28, 25), 11)
+    picture = replace(picture, marks=(*picture.marks, words, said))
+    for view in NOVEL_VIEWS:
+        picture = picture.beside(draw_novel_view(result, view, side_px=SIDE_PX))
+    return picture
+
+
+def _as_result(points_px: Floats, intrinsics: Intrinsics, person: LiftedPerson) -> PhotoResult:
+    """A square photo around the joints; the camera's rays stay where they are."""
+    low, high = points_px.min(0), points_px.max(0)
+    side = float((high - low).max()) * (1 + 2 * _MARGIN)
+    corner = 0.5 * (low + high) - side / 2
+    moved = points_px - corner
+    x, y = intrinsics.principal_point_px - corner
+    seen = SeenPerson(
+        box_px=(0.0, 0.0, side, side),
+        score=None,
+        joints_px=moved,
+        present=np.ones(len(points_px), bool),
+        confidence=None,
+        sigma_px=None,
+        lifted=person,
+    )
+    return PhotoResult(
+        width_px=round(side),
+        height_px=round(side),
+        orientation=1,
+        intrinsics=Intrinsics(intrinsics.focal_length_px, (float(x), float(y)), "request"),
+        people=(seen,),
+        timings_ms={},
+    )

@@ -1,0 +1,193 @@
+"""The methods that the tables compare, and the paper's upper bounds.
+
+The paper's method is the product's ``method="paper"``: k nearest by eq. 4, M* by eq. 5, sorted by
+eq. 4 again, X* by eq. 6. ``X`` is the exemplar as M* places it. All answers are (N, 14, 3) mm in
+the camera frame of the view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from app.lifting.geometry import CentredView, Floats, Integers, Mask, centre_view
+from app.lifting.lifter import Lifter, LiftingSettings
+from app.lifting.types import LiftedPerson, Method, Observation
+from app.lifting.warp import warp_weak_perspective
+from evaluation.metrics import align, rigid_error_mm
+from evaluation.paper.network import Network, warp_onto
+from evaluation.paper.views import SceneCamera, Views
+from library_store.library import Library
+
+CANDIDATES = 300
+"""Exemplars, nearest by their inter-joint distances, among which the optimal one is sought."""
+
+
+@dataclass(frozen=True)
+class Seen2D:
+    """2D of N views.
+
+    ``points_px`` (N, 14, 2); from a network also its own ``confidence`` (N, 14) and
+    ``covariance_px2`` (N, 14, 2, 2), which the paper's method does not look at.
+    """
+
+    points_px: Floats
+    confidence: Floats | None = None
+    covariance_px2: Floats | None = None
+
+    def of(self, rows: Integers) -> Seen2D:
+        """That of some of the views."""
+        confidence, covariance = self.confidence, self.covariance_px2
+        return Seen2D(
+            self.points_px[rows],
+            None if confidence is None else confidence[rows],
+            None if covariance is None else covariance[rows],
+        )
+
+    def observation(self, row: int, *, plain: bool) -> Observation:
+        """One person; ``plain``: all joints alike."""
+        points = self.points_px[row]
+        if plain or self.confidence is None or self.covariance_px2 is None:
+            return Observation(points, np.ones(len(points)))
+        return Observation(points, self.confidence[row], self.covariance_px2[row])
+
+
+@dataclass(frozen=True)
+class Answers:
+    """``answer_mm`` (N, 14, 3): the method's; ``exemplar_mm``: X, where there is one."""
+
+    answer_mm: Floats
+    exemplar_mm: Floats | None = None
+
+
+Lift = Callable[[Views, Seen2D], Answers]
+
+
+@dataclass(frozen=True)
+class System:
+    """A named way to lift."""
+
+    label: str
+    lift: Lift
+
+
+def paper_method(library: Library, k: int = 10) -> Lift:
+    """The paper's: X* as the answer, X beside it."""
+    return _by_lifter(library, "paper", LiftingSettings(paper_shortlist=k))
+
+
+def default_method(library: Library) -> Lift:
+    """What the service answers by default."""
+    return _by_lifter(library, "fusion", LiftingSettings())
+
+
+def learned(network: Network, *, warped: bool) -> Lift:
+    """The MLP's answer, or that put onto the joints' rays."""
+
+    def lift(views: Views, seen: Seen2D) -> Answers:
+        turned = _centred(views, seen)
+        points = np.stack([view.points for view in turned])
+        present: Mask = np.ones(points.shape[:2], dtype=bool)
+        poses = network.lift(points, present)
+        if warped:
+            poses = warp_onto(poses, points, present)
+        return Answers(_back(turned, poses))
+
+    return lift
+
+
+def known_depths(views: Views, seen: Seen2D, placed_mm: Floats | None = None) -> Floats:
+    """``[s x, Z]`` with the depths of ``placed_mm``, by default the truth's: an upper bound."""
+    turned = _centred(views, seen)
+    placed = views.joints_mm if placed_mm is None else placed_mm
+    warped = [
+        warp_weak_perspective(
+            joints @ view.rotation.T, view.points, np.ones(len(joints), dtype=bool)
+        )
+        for joints, view in zip(placed, turned, strict=True)
+    ]
+    return _back(turned, np.stack(warped))
+
+
+def optimal_exemplars(library: Library, views: Views) -> Floats:
+    """Of each view the exemplar nearest to the truth after a rigid motion, moved there.
+
+    Sought among the :data:`CANDIDATES` nearest by the distances between all pairs of joints, which
+    no rigid motion changes. Frames seen by several cameras are looked up once.
+    """
+    joints = views.joints_mm.shape[1]
+    a, b = np.triu_indices(joints, 1)
+
+    def distances(poses: Floats) -> NDArray[np.float32]:
+        apart = ((poses[:, a] - poses[:, b]) ** 2).sum(-1)
+        return np.asarray(np.sqrt(apart), dtype=np.float32)
+
+    table = np.concatenate(
+        [
+            distances(library.poses_mm(np.arange(start, min(start + 10_000, len(library)))))
+            for start in range(0, len(library), 10_000)
+        ]
+    )
+    squared = (table**2).sum(1)
+    frames, which = np.unique(
+        np.stack([views.scene, views.at], axis=1), axis=0, return_inverse=True
+    )
+    which = which.reshape(-1)
+    best = np.empty((len(frames), joints, 3))
+    for number in range(len(frames)):
+        truth = views.joints_mm[np.flatnonzero(which == number)[0]]
+        rank = squared - 2.0 * (table @ distances(truth[None])[0])
+        n = min(CANDIDATES, len(table))
+        poses = library.poses_mm(np.argpartition(rank, n - 1)[:n])
+        best[number] = poses[rigid_error_mm(poses, truth).mean(1).argmin()]
+    return align(best[which], views.joints_mm, scale=False)
+
+
+def _by_lifter(library: Library, method: Method, settings: LiftingSettings) -> Lift:
+    lifter = Lifter(library, settings)
+
+    def lift(views: Views, seen: Seen2D) -> Answers:
+        answer = np.empty_like(views.joints_mm)
+        exemplar = np.empty_like(views.joints_mm)
+        for camera, rows in views.by_camera():
+            people = [seen.observation(row, plain=method == "paper") for row in rows.tolist()]
+            lifted = lifter.lift(people, camera.intrinsics, method=method, n_candidates=1)
+            for row, person in zip(rows.tolist(), lifted, strict=True):
+                if not isinstance(person, LiftedPerson):
+                    # A mean pose would flatter.
+                    answer[row] = exemplar[row] = _nothing(seen.points_px[row], camera)
+                    continue
+                answer[row], exemplar[row] = person.joints_3d_mm, person.exemplar.joints_mm
+        return Answers(answer, exemplar if method == "paper" else None)
+
+    return lift
+
+
+def _nothing(points_px: Floats, camera: SceneCamera) -> Floats:
+    """All joints at one place."""
+    pinhole = camera.intrinsics
+    x, y = (points_px.mean(0) - pinhole.principal_point_px) / pinhole.focal_length_px
+    return np.tile(1000.0 * np.array([x, y, 1.0]), (len(points_px), 1))
+
+
+def _centred(views: Views, seen: Seen2D) -> list[CentredView]:
+    turned = []
+    for row in range(len(views)):
+        pinhole = views.camera_of(row).intrinsics
+        turned.append(
+            centre_view(
+                seen.points_px[row],
+                np.ones(views.joints_mm.shape[1]),
+                None,
+                pinhole.focal_length_px,
+                np.array(pinhole.principal_point_px),
+            )
+        )
+    return turned
+
+
+def _back(turned: list[CentredView], poses: Floats) -> Floats:
+    return np.stack([view.to_photo(pose) for view, pose in zip(turned, poses, strict=True)])
