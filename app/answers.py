@@ -234,6 +234,7 @@ def _person(person: SeenPerson, intrinsics: Intrinsics, wording: Wording) -> sch
             focal_source=intrinsics.source,
             rotation=_matrix(best.rotation),
             translation_mm=_vector(best.translation_mm),
+            scale=round(best.scale, RATIO_DIGITS),
             reprojection_error_px=round(best.reprojection_error_px, LENGTH_DIGITS),
         ),
         joints_3d=tuple(

@@ -190,10 +190,11 @@ class Candidate(Answer):
 
 
 class Camera(Answer):
-    """M* (eq. 5) of the best exemplar: X_camera = rotation @ X_exemplar + translation.
+    """M* (eq. 5) of the best exemplar: X_camera = scale * (rotation @ X_exemplar) + translation.
 
-    The exemplar's own frame is root-centred with Y up. For a mirrored photo the map contains the
-    reflection: the determinant of ``rotation`` is then -1.
+    ``scale`` is 1 unless the request gave ``subject_height_mm``. The exemplar's own frame is
+    root-centred with Y up. For a mirrored photo the map contains the reflection: the determinant
+    of ``rotation`` is then -1.
     """
 
     model: Literal["pinhole"] = "pinhole"
@@ -202,6 +203,7 @@ class Camera(Answer):
     focal_source: Literal["request", "exif", "assumed"]
     rotation: Matrix3
     translation_mm: Vector3
+    scale: float
     reprojection_error_px: float
 
 

@@ -21,6 +21,7 @@ left. It often tells which way a foreshortened limb points.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -31,21 +32,35 @@ from app.lifting.posterior import STANDARD_PX_PER_MM
 from app.lifting.proportions import asymmetry
 from library_store.skeleton import L_HIP, LSP14, R_HIP
 
+_LIMBS = ("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")
+_LIMB_ENDS = np.stack(
+    [
+        np.eye(LSP14.n_joints)[LSP14.index(f"{side}_{end}")]
+        - np.eye(LSP14.n_joints)[LSP14.index(f"{side}_{start}")]
+        for side in ("r", "l")
+        for limb in _LIMBS
+        for start, end in pairwise(limb)
+    ]
+)
+"""(8, J): the far end of each limb segment less its near end."""
+
 
 @dataclass(frozen=True)
 class FusionSettings:
     """What shapes the local prior.
 
     Chosen on mocap subjects of whom no table is measured (and who were not in that trial's
-    library), except ``outlier_prior``: other frames of the held-out subjects of the tables, and
-    ``bandwidth_px``, ``localisation_bones``, ``proportion_spread``, ``asymmetry``: a third of the
+    library), except those that came later: ``bandwidth_px``, ``localisation_bones``,
+    ``proportion_spread``, ``asymmetry``, ``outlier_prior`` and ``ambiguous_mm`` on some of the
     even-numbered people of the tables' sets.
 
     ``bandwidth_px``, ``adaptive``, ``granularity_px``, ``localisation_bones``: see
     ``ensemble.local_prior``; ``proportion_spread``: see ``ensemble.place_ensemble``;
     ``asymmetry``: standard deviation of the log ratio of two sides' lengths; ``noise_px``: the
     noise levels ν that are weighed by evidence; ``outlier_prior``: probability that a joint of
-    full confidence is elsewhere.
+    full confidence is elsewhere. Depth is ambiguous if a limb's far end is within
+    ``ambiguous_sigmas`` of being as deep as its near end and the standard deviation of that
+    difference is above ``ambiguous_mm``.
     """
 
     bandwidth_px: float = 16.0
@@ -55,7 +70,9 @@ class FusionSettings:
     proportion_spread: float = 0.1
     asymmetry: float = 0.15
     noise_px: tuple[float, ...] = (1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0)
-    outlier_prior: float = 0.02
+    outlier_prior: float = 0.06
+    ambiguous_mm: float = 110.0
+    ambiguous_sigmas: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -64,13 +81,15 @@ class FusedPose:
 
     ``joints_mm`` (J, 3) in the centred view's camera frame; ``spread_mm`` (J,) posterior standard
     deviation of a joint about the root, all axes together, not calibrated; ``noise_px`` the noise
-    found, standard pixels; ``outlier`` the joint that contradicts the others, or None.
+    found, standard pixels; ``outlier`` the joint that contradicts the others, or None;
+    ``ambiguous``: some limb may as well point towards the camera as away from it.
     """
 
     joints_mm: Floats
     spread_mm: Floats
     noise_px: float
     outlier: int | None
+    ambiguous: bool
 
 
 def fuse(
@@ -123,6 +142,7 @@ def fuse(
         spread_mm=_spread_about_root(posterior),
         noise_px=float(np.sqrt(evidence.mean_noise_var)),
         outlier=None if suspect is None else int(seen[suspect]),
+        ambiguous=_is_ambiguous(posterior, settings),
     )
 
 
@@ -149,6 +169,16 @@ def _made_symmetric(pose: LocalPrior, px_per_unit: float, sigma: float) -> Local
     return LocalPrior(
         pose.mean - gain @ ratio, pose.covariance - gain @ reach.T, pose.root_depth_mm
     )
+
+
+def _is_ambiguous(pose: LocalPrior, settings: FusionSettings) -> bool:
+    """Whether some limb may as well point towards the camera as away from it."""
+    depths = slice(2 * LSP14.n_joints, None)
+    along = _LIMB_ENDS @ pose.mean[depths]
+    variance = ((_LIMB_ENDS @ pose.covariance[depths, depths]) * _LIMB_ENDS).sum(1)
+    sigma = np.sqrt(np.maximum(variance, 0.0))
+    undecided = np.abs(along) < settings.ambiguous_sigmas * sigma
+    return bool((undecided & (sigma * pose.root_depth_mm > settings.ambiguous_mm)).any())
 
 
 def _spread_about_root(pose: LocalPrior) -> Floats:

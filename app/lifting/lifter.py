@@ -178,6 +178,8 @@ class Lifter:
             confidence, outliers = without, outliers + 1
         if outliers:
             warnings.append("inconsistent_joints")
+        if method == "fusion" and fused.ambiguous:
+            warnings.append("ambiguous_depth")
 
         shortlist = self._shortlist(view, confidence, neighbours)
         lap("camera")
@@ -301,6 +303,7 @@ class Lifter:
             joints[:, present], intrinsics.focal_length_px, np.array(intrinsics.principal_point_px)
         )
         errors = np.sqrt(((pixels - person.joints_px[present]) ** 2).sum(-1).mean(-1))
+        scale = np.ones(len(joints))
         if subject_height_mm is not None:
             scale = subject_height_mm / stature_mm(joints)
             joints, translations = scale[:, None, None] * joints, scale[:, None] * translations
@@ -314,6 +317,7 @@ class Lifter:
                 reprojection_error_px=float(errors[rank]),
                 rotation=rotations[rank],
                 translation_mm=translations[rank],
+                scale=float(scale[rank]),
                 joints_mm=joints[rank],
             )
             for rank, entry in enumerate(shortlist.entries[:n].tolist())

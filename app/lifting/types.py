@@ -65,8 +65,8 @@ class Hypothesis:
 
     ``probability`` is eq. 4 over the whole shortlist; ``distance`` the descriptor's;
     ``reprojection_error_px`` the RMS over observed joints, in pixels of the photo; ``joints_mm``
-    (14, 3) = ``scale * (rotation @ exemplar) + translation_mm`` in the camera frame, where scale
-    is 1 unless a subject height was given.
+    (14, 3) = ``scale * (rotation @ exemplar) + translation_mm`` in the camera frame; ``scale`` is 1
+    unless a subject height was given.
     """
 
     entry: int
@@ -77,6 +77,7 @@ class Hypothesis:
     reprojection_error_px: float
     rotation: Floats
     translation_mm: Floats
+    scale: float
     joints_mm: Floats
 
 

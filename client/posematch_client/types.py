@@ -27,10 +27,11 @@ class BatchItem(TypedDict):
 
 
 class Camera(TypedDict):
-    """M* (eq. 5) of the best exemplar: X_camera = rotation @ X_exemplar + translation.
+    """M* (eq. 5) of the best exemplar: X_camera = scale * (rotation @ X_exemplar) + translation.
 
-    The exemplar's own frame is root-centred with Y up. For a mirrored photo the map contains the
-    reflection: the determinant of ``rotation`` is then -1.
+    ``scale`` is 1 unless the request gave ``subject_height_mm``. The exemplar's own frame is
+    root-centred with Y up. For a mirrored photo the map contains the reflection: the determinant
+    of ``rotation`` is then -1.
     """
 
     focal_length_px: float
@@ -39,6 +40,7 @@ class Camera(TypedDict):
     principal_point_px: list[float]
     reprojection_error_px: float
     rotation: list[list[float]]
+    scale: float
     translation_mm: list[float]
 
 

@@ -173,6 +173,12 @@ def test_subject_height_scales_without_changing_the_picture(
     assert (usual["scale_source"], tall["scale_source"]) == ("library", "request")
     ratio = joints_mm(tall) / joints_mm(usual)
     np.testing.assert_allclose(ratio, ratio[0, 2], rtol=0.02)
+    exemplar = server.client.get(f"/v1/exemplars/{tall['exemplar']['id']}").json()
+    camera = tall["camera"]
+    turned = np.array(exemplar["joints_mm"]) @ np.array(camera["rotation"]).T
+    placed = camera["scale"] * turned + camera["translation_mm"]
+    np.testing.assert_allclose(placed, tall["exemplar"]["joints_mm"], atol=0.02)
+    assert usual["camera"]["scale"] == 1
 
 
 def test_nobody_is_an_answer(server: Server) -> None:

@@ -32,6 +32,8 @@ const WARNINGS = {
     "Not everything of this person is seen. The joints that are missing come from similar poses, with a larger uncertainty.",
   inconsistent_joints: () =>
     "Some 2D joints contradict the others as a human pose; they were set aside and placed from the rest.",
+  ambiguous_depth: () =>
+    "Some limb may as well point towards the camera as away from it; the uncertainty says how much that matters.",
   far_from_library: () =>
     "No pose of the library explains these joints well. Take the 3D as a rough guess.",
 };

@@ -123,6 +123,17 @@ def test_subject_height_is_met_exactly_and_changes_no_image(
     np.testing.assert_allclose(scaled.root_mm, ratio[0, 2] * plain.root_mm)
 
 
+def test_camera_places_the_exemplar_at_a_given_height(
+    library: Library, lifter: Lifter, people: People
+) -> None:
+    for height_mm in (None, 1250.0):
+        person = lift_one(lifter, people.observation(2), subject_height_mm=height_mm)
+        for one in person.candidates:
+            placed = one.scale * (library.poses_mm(one.entry) @ one.rotation.T) + one.translation_mm
+            np.testing.assert_allclose(one.joints_mm, placed, atol=1e-6)
+            assert (one.scale == 1.0) == (height_mm is None)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_moving_photo_and_principal_point_together_changes_nothing(
     lifter: Lifter, people: People, method: Method
@@ -214,6 +225,18 @@ def test_a_joint_far_off_is_set_aside(lifter: Lifter, people: People) -> None:
     person = lift_one(lifter, observe(pixels))
     assert "inconsistent_joints" in person.warnings
     assert "inconsistent_joints" not in lift_one(lifter, people.observation(1)).warnings
+
+
+def test_a_limb_that_may_point_either_way_is_said(lifter: Lifter, people: People) -> None:
+    errors: dict[bool, list[float]] = {False: [], True: []}
+    for observation, truth in zip(
+        (people.observation(i) for i in range(len(people.joints_px))), people.joints_mm, strict=True
+    ):
+        person = lift_one(lifter, observation)
+        error = rigid_error_mm(person.joints_3d_mm[None], truth[None]).mean()
+        errors["ambiguous_depth" in person.warnings].append(float(error))
+    assert min(len(group) for group in errors.values()) >= 4
+    assert np.mean(errors[True]) > np.mean(errors[False])
 
 
 def test_an_assumed_focal_length_is_said(lifter: Lifter, people: People) -> None:
