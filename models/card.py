@@ -45,6 +45,7 @@ class PoseOutput(_Frozen):
     target_sigma_cells: float = Field(description="blur of the training targets")
     maps: Literal["logits", "beliefs"]
     border_grey: int = Field(0, ge=0, le=255, description="what crops have beyond the photo's edge")
+    looks: Literal[1, 2] = Field(1, description="2: a second, mirrored and upright look per crop")
     confidence: ConfidenceCalibration | None = None
     spread: SpreadCalibration | None = None
 

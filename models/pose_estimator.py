@@ -15,6 +15,7 @@ from models.errors import ModelError
 from models.heatmaps import Floats, Joints2D, calibrated, read_maps
 from models.person_detector import PersonBox
 from models.providers import ProviderChoice, Runtime
+from models.second_look import looked_at
 from models.session import OnnxModel
 
 
@@ -69,7 +70,8 @@ class PoseEstimator:
             crops.append(crop)
             scales.append(scale)
             origins.append(origin)
-        return self.read(self._model.run(np.stack(crops)), scales, origins)
+        maps = looked_at(self._model.run, np.stack(crops), self._output.looks)
+        return self.read(maps, scales, origins)
 
     def read(
         self,

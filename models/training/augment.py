@@ -8,12 +8,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from library_store.skeleton import LSP14
+from library_store.skeleton import L_HIP, L_SHOULDER, LSP14, R_HIP, R_SHOULDER
 from models.training.dataset import Image, LabelledCrop
 
 MIRROR = np.array(LSP14.mirror)
 CROP_SCALE = 1.25
 """Side of a canonical crop over the extent of the joints."""
+UPRIGHT_SHARE = 0.6
+"""Of the views that are turned until the trunk stands upright: what the second look at a person
+gets. The others teach the first look, which meets people as they are."""
+UPRIGHT_SPREAD_DEG = 15.0
+TORSO = [R_SHOULDER, L_SHOULDER, R_HIP, L_HIP]
 
 
 @dataclass(frozen=True)
@@ -97,10 +102,7 @@ def random_view(
     if rng.random() < 0.12:  # cut off at a random side
         scale *= rng.uniform(0.55, 0.9)
         offset = rng.uniform(-0.3, 0.3, 2)
-    if rng.random() < (0.25 if crop.wild else 0.08):
-        angle = rng.uniform(-np.pi, np.pi)
-    else:
-        angle = float(np.deg2rad(np.clip(rng.normal(0, 25), -70, 70)))
+    angle = _random_turn(crop, rng)
     flip = bool(rng.random() < 0.5)
     side = extent * scale
     matrix = crop_matrix(
@@ -112,6 +114,17 @@ def random_view(
         for _ in range(rng.integers(1, 3)):
             _occlude(image, sample.joints_px, presence, other.image, rng)
     return Sample(expose(image, rng), sample.joints_px, sample.weight, presence)
+
+
+def _random_turn(crop: LabelledCrop, rng: np.random.Generator) -> float:
+    """Angle (rad) to turn the image by, clockwise as seen."""
+    if rng.random() < UPRIGHT_SHARE and (crop.weight[TORSO] > 0).all():
+        shoulders, hips = crop.joints_px[TORSO[:2]].mean(0), crop.joints_px[TORSO[2:]].mean(0)
+        right, down = (float(v) for v in shoulders - hips)
+        return float(np.deg2rad(rng.normal(0, UPRIGHT_SPREAD_DEG)) - np.arctan2(right, -down))
+    if rng.random() < (0.25 if crop.wild else 0.08):
+        return float(rng.uniform(-np.pi, np.pi))
+    return float(np.deg2rad(np.clip(rng.normal(0, 25), -70, 70)))
 
 
 def _occlude(

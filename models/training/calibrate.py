@@ -27,6 +27,7 @@ from models.card import (
 from models.cost import cpu_ms
 from models.heatmaps import Floats, calibrated, read_maps
 from models.pck import correct_keypoints
+from models.second_look import looked_at
 from models.session import OnnxModel
 from models.training.augment import Sample, canonical, random_view
 from models.training.dataset import LabelledCrop
@@ -56,7 +57,7 @@ def read_all(model: OnnxModel, output: PoseOutput, samples: list[Sample]) -> Rea
     parts = []
     for start in range(0, len(samples), 32):
         chunk = samples[start : start + 32]
-        maps = model.run(np.stack([s.image for s in chunk]))
+        maps = looked_at(model.run, np.stack([s.image for s in chunk]), output.looks)
         parts.append(
             read_maps(maps, len(output.joint_names), output.maps, output.target_sigma_cells)
         )

@@ -19,6 +19,7 @@ from models.card import ModelCard, PoseOutput, read_card, write_card
 from models.errors import AnnotationError, ModelError
 from models.heatmaps import read_maps
 from models.pck import correct_keypoints
+from models.second_look import looked_at
 from models.session import OnnxModel
 from models.training import loop
 from models.training.augment import canonical, random_view
@@ -87,7 +88,7 @@ def pck(directory: Path, name: str, crops: list[LabelledCrop]) -> float:
     right = total = 0
     for crop in crops:
         sample = canonical(crop, output.input_px)
-        maps = model.run(sample.image[None])
+        maps = looked_at(model.run, sample.image[None], output.looks)
         cells = read_maps(maps, len(output.joint_names), output.maps, output.target_sigma_cells).at[
             0
         ]

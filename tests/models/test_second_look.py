@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from library_store.skeleton import L_HIP, L_SHOULDER, LSP14, R_HIP, R_SHOULDER
+from models.heatmaps import sub_cell_peaks
+from models.second_look import leans, looked_at, mirrored_upright
+
+CELLS, SIZE = 40, 160
+STRIDE = SIZE // CELLS
+
+
+def gaussians(joints_cells: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Logits (1, 15, CELLS, CELLS) with a peak on each joint."""
+    y, x = np.mgrid[:CELLS, :CELLS]
+    distance2 = (x - joints_cells[:, 0, None, None]) ** 2 + (
+        y - joints_cells[:, 1, None, None]
+    ) ** 2
+    maps = np.concatenate([-distance2 / 4, np.zeros((1, CELLS, CELLS))])
+    return maps[None].astype(np.float32)
+
+
+def leaning(angle_deg: float) -> NDArray[np.float64]:
+    """Joints (14, 2) in cells whose trunk leans clockwise by the angle."""
+    rng = np.random.default_rng(1)
+    upright = rng.uniform(-9, 9, (14, 2))
+    upright[[R_SHOULDER, L_SHOULDER, R_HIP, L_HIP]] = [(-4, -8), (4, -8), (-3, 6), (3, 6)]
+    a = np.deg2rad(angle_deg)
+    turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+    joints: NDArray[np.float64] = upright @ turn.T + (CELLS - 1) / 2
+    return joints
+
+
+@pytest.mark.parametrize("angle_deg", [0, 30, -75, 140, 180])
+def test_the_lean_is_read_off_the_maps(angle_deg: float) -> None:
+    found = np.rad2deg(leans(gaussians(leaning(angle_deg))))[0]
+    assert abs((found - angle_deg + 180) % 360 - 180) < 5
+
+
+@pytest.mark.parametrize("angle_deg", [0, 30, -75, 140, 180])
+def test_the_second_view_is_upright_and_mirrored(angle_deg: float) -> None:
+    joints = leaning(angle_deg)
+    matrix = mirrored_upright(np.deg2rad(angle_deg), CELLS)
+    seen = joints @ matrix[:, :2].T + matrix[:, 2]
+    trunk = seen[[R_SHOULDER, L_SHOULDER]].mean(0) - seen[[R_HIP, L_HIP]].mean(0)
+    assert abs(trunk[0]) < 1e-9
+    assert trunk[1] < 0
+    assert np.linalg.det(matrix[:, :2]) == pytest.approx(-1)
+    back = (seen - matrix[:, 2]) @ np.linalg.inv(matrix[:, :2]).T
+    np.testing.assert_allclose(back, joints)
+
+
+@pytest.mark.parametrize("angle_deg", [0, 30, -75, 140, 180])
+def test_two_looks_that_agree_change_nothing(angle_deg: float) -> None:
+    """A network that finds the joints in both views: the mean is where they are."""
+    joints = leaning(angle_deg)
+    views: list[NDArray[np.uint8]] = []
+
+    def run(images: NDArray[np.uint8]) -> NDArray[np.float32]:
+        views.append(images)
+        if len(views) == 1:
+            return gaussians(joints)
+        lean = leans(gaussians(joints))[0]
+        matrix = mirrored_upright(lean, CELLS)
+        return gaussians((joints @ matrix[:, :2].T + matrix[:, 2])[list(LSP14.mirror)])
+
+    image = np.random.default_rng(0).integers(0, 255, (1, SIZE, SIZE, 3)).astype(np.uint8)
+    both = looked_at(run, image, 2)
+    assert len(views) == 2
+    found, _ = sub_cell_peaks(np.exp(both[:, :14]))
+    np.testing.assert_allclose(found[0], joints, atol=0.15)
+
+
+def test_one_look_is_the_network_itself() -> None:
+    maps = gaussians(leaning(20))
+    seen = looked_at(lambda _: maps, np.zeros((1, SIZE, SIZE, 3), np.uint8), 1)
+    assert seen is maps
+
+
+def test_what_only_the_first_look_sees_stays_its_own() -> None:
+    """Turned by 45 degrees, the corners of the crop fall outside the second view."""
+    first = gaussians(leaning(45))
+
+    calls = iter([first, np.full_like(first, 7.0)])
+    both = looked_at(lambda _: next(calls), np.zeros((1, SIZE, SIZE, 3), np.uint8), 2)
+    np.testing.assert_array_equal(both[..., 0, 0], first[..., 0, 0])
+    middle = CELLS // 2
+    np.testing.assert_allclose(
+        both[..., middle, middle], (first[..., middle, middle] + 7) / 2, rtol=1e-6
+    )
