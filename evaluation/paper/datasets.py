@@ -95,9 +95,7 @@ def find_h36m(root: Path) -> Found:
     for clip in clips:
         column = h36m_column(clip.action)
         if column is None:
-            found.missing.append(
-                f"{clip.name}: {clip.action!r} is no action of the paper; left out"
-            )
+            found.missing.append(f"action {clip.action!r}: not in the paper, left out")
             continue
         try:
             cameras = virtual_cameras(rng) if metadata is None else h36m_cameras(metadata, clip)

@@ -25,6 +25,8 @@ from library_store.library import Library
 SIDE_PX = 420
 _GROUND = 236
 _MARGIN = 0.15
+PEOPLE = 100
+"""Looked at to choose the ones that are drawn."""
 
 
 @dataclass(frozen=True)
@@ -71,28 +73,41 @@ def side_by_side(test: TestSet, source: str, library: Library) -> list[Picture]:
     ]
 
 
+def liftable(test: TestSet, source: str, library: Library) -> bool:
+    """Whether there is anybody to draw."""
+    return source in test.seen and bool(_errors(test, source, library)[1])
+
+
 def _at_share(test: TestSet, source: str, library: Library, share: float) -> int:
-    """The person at this share of the default method's errors, of at most 200 people."""
-    rows = np.arange(len(test.views))[:: max(1, len(test.views) // 200)]
-    errors = [
-        float(
-            rigid_error_mm(
-                _lift(test, library, Shown(int(row), source, "fusion")).joints_3d_mm,
-                test.views.joints_mm[row],
-            ).mean()
-        )
-        for row in rows
-    ]
-    return int(rows[np.argsort(errors)[min(int(share * len(rows)), len(rows) - 1)]])
+    """The person at this share of the default method's errors."""
+    rows, errors = _errors(test, source, library)
+    return rows[int(np.argsort(errors)[min(int(share * len(rows)), len(rows) - 1)])]
 
 
-def _lift(test: TestSet, library: Library, shown: Shown) -> LiftedPerson:
+def _errors(test: TestSet, source: str, library: Library) -> tuple[list[int], list[float]]:
+    """Rows and P1 by the default method, of about a hundred people who can be lifted."""
+    rows, errors = [], []
+    for row in range(0, len(test.views), max(1, len(test.views) // PEOPLE)):
+        person = _try(test, library, Shown(row, source, "fusion"))
+        if person is not None:
+            truth = test.views.joints_mm[row]
+            rows.append(row)
+            errors.append(float(rigid_error_mm(person.joints_3d_mm, truth).mean()))
+    return rows, errors
+
+
+def _try(test: TestSet, library: Library, shown: Shown) -> LiftedPerson | None:
     camera = test.views.camera_of(shown.row)
     person = test.seen[shown.source].observation(shown.row, plain=shown.method == "paper")
     (lifted,) = Lifter(library).lift([person], camera.intrinsics, method=shown.method)
-    if not isinstance(lifted, LiftedPerson):
-        raise RuntimeError(f"person {shown.row} cannot be lifted: {lifted.reason}")
-    return lifted
+    return lifted if isinstance(lifted, LiftedPerson) else None
+
+
+def _lift(test: TestSet, library: Library, shown: Shown) -> LiftedPerson:
+    person = _try(test, library, shown)
+    if person is None:
+        raise RuntimeError(f"person {shown.row} cannot be lifted")
+    return person
 
 
 def _line(

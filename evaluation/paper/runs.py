@@ -87,10 +87,15 @@ class Report:
 
 @dataclass(frozen=True)
 class Protocols:
-    """The test sets of one data set, by name, and the libraries of its training frames."""
+    """The test sets of one data set, and the libraries of its training frames.
+
+    ``p1_x``, ``p2_x``: those of which there is 2D from a network, None where there is none.
+    """
 
     p1: TestSet
     p2: TestSet
+    p1_x: TestSet | None
+    p2_x: TestSet | None
     diagnostic: TestSet
     p1_library: Library
     p2_library: Library
@@ -111,6 +116,8 @@ def run_users_data(root: Path, options: Options) -> None:
         protocols = Protocols(
             p1=_test_set(look(test1, seconds_apart=P1_SECONDS), h36m, options),
             p2=_test_set(look(test2, seconds_apart=P2_SECONDS), h36m, options),
+            p1_x=None,
+            p2_x=None,
             diagnostic=_diagnostic_set(test2, h36m, options),
             p1_library=_frames_library("h36m-p1", train1, options),
             p2_library=_frames_library("h36m-p2", train2, options),
@@ -121,8 +128,8 @@ def run_users_data(root: Path, options: Options) -> None:
         if videos:
             protocols = replace(
                 protocols,
-                p1=_with_videos(protocols.p1, videos, told),
-                p2=_with_videos(protocols.p2, videos, told),
+                p1_x=_with_videos(protocols.p1, videos, told),
+                p2_x=_with_videos(protocols.p2, videos, told),
             )
         else:
             reason = "S*/Videos/*.mp4" if h36m.real_cameras else "metadata.xml and the videos"
@@ -152,9 +159,13 @@ def run_cmu(mocap: Path, cross_set: Path | None, noise_px: float, options: Optio
     test = found.of(held_out)
     told.say("# The paper's tables on CMU's mocap", _what_is_drawn(options))
     library = _frames_library("cmu-frames", train, options)
+    p1 = _test_set(look(test, seconds_apart=P1_SECONDS), found, options)
+    p2 = _test_set(look(test, seconds_apart=P2_SECONDS), found, options)
     protocols = Protocols(
-        p1=_noisy(_test_set(look(test, seconds_apart=P1_SECONDS), found, options), noise_px),
-        p2=_noisy(_test_set(look(test, seconds_apart=P2_SECONDS), found, options), noise_px),
+        p1=p1,
+        p2=p2,
+        p1_x=_noisy(p1, noise_px),
+        p2_x=_noisy(p2, noise_px),
         diagnostic=_diagnostic_set(test, found, options),
         p1_library=library,
         p2_library=library,
@@ -179,12 +190,12 @@ def run_cmu(mocap: Path, cross_set: Path | None, noise_px: float, options: Optio
 def _all_tables(told: Report, data: Protocols, options: Options) -> None:
     """Tables 1 to 8, figures 2 to 8."""
     p1, p2, library = data.p1, data.p2, data.p1_library
-    has_x = "x" in p1.seen
     systems, systems2 = _systems(library, options), _systems(data.p2_library, options)
     told.say(
         f"Libraries of training frames: {len(library):,} exemplars (protocol 1), "
         f"{len(data.p2_library):,} (protocol 2). Test views: {len(p1.views):,}, {len(p2.views):,}, "
-        f"{len(data.diagnostic.views):,} (diagnostic). *x*: {data.x_is}. Errors in mm."
+        f"{len(data.diagnostic.views):,} (diagnostic); of these with x: "
+        f"{_count(data.p1_x):,}, {_count(data.p2_x):,}. *x*: {data.x_is}. Errors in mm."
     )
 
     def by_action(
@@ -193,34 +204,38 @@ def _all_tables(told: Report, data: Protocols, options: Options) -> None:
         told.say(f"## {title}")
         told.say(report.action_table(test.columns, rows, found, by_action=data.by_action))
 
-    if has_x:
-        found = study.comparison(p1, "x", systems, rigid_error_mm)
-        by_action("Table 1: protocol 1, given x", published.P1, p1, found)
+    if data.p1_x is not None:
+        found = study.comparison(data.p1_x, "x", systems, rigid_error_mm)
+        by_action("Table 1: protocol 1, given x", published.P1, data.p1_x, found)
     found = study.comparison(p1, "gt", systems, rigid_error_mm)
     by_action("Table 2: protocol 1, given true 2D", published.P1_GT, p1, found)
-    if "x" in p2.seen:
-        found = study.comparison(p2, "x", systems2, root_centred_error_mm)
-        by_action("Table 4: protocol 2, given x", published.P2, p2, found)
+    if data.p2_x is not None:
+        found = study.comparison(data.p2_x, "x", systems2, root_centred_error_mm)
+        by_action("Table 4: protocol 2, given x", published.P2, data.p2_x, found)
     found = study.comparison(p2, "gt", systems2, root_centred_error_mm)
     by_action("Protocol 2, given true 2D (not in the paper)", (), p2, found)
     found = study.diagnostic(data.diagnostic, data.p2_library, systems2[1:])
     title = "Table 5: similarity alignment, first 30 seconds, first camera, true 2D"
     by_action(title, published.DIAGNOSTIC, data.diagnostic, found)
 
-    for number, source, rows in ((6, "x", published.PREDICTED), (7, "gt", published.TRUE_2D)):
-        if source in p1.seen:
+    for number, source, rows, test in (
+        (6, "x", published.PREDICTED, data.p1_x),
+        (7, "gt", published.TRUE_2D, p1),
+    ):
+        if test is not None:
             told.say(f"## Table {number}: with and without the warp, given {source}, protocol 1")
-            ours = study.warping(p1, source, library)
+            ours = study.warping(test, source, library)
             theirs = [*rows, None][: len(ours)]
             told.say(report.short_table(list(zip(theirs, ours, strict=True))))
     told.say("## Table 8: the optimal exemplar, protocol 1")
     best = study.optimal(p1, library)
     told.say(report.short_table(list(zip(published.OPTIMAL, best, strict=True))))
-    _curves(told, p1, library, "training frames", "", options)
+    shown = data.p1_x or p1
+    _curves(told, shown, library, "training frames", "", options)
     if options.library is not None:
         own = load(options.library)
-        _curves(told, p1, own, own.manifest.name, "-own", options)
-    _figures(told, p1, library)
+        _curves(told, shown, own, own.manifest.name, "-own", options)
+    _figures(told, shown, library)
 
 
 def _curves(
@@ -253,13 +268,15 @@ def _curves(
 
 def _figures(told: Report, p1: TestSet, library: Library) -> None:
     told.say("## Figures 2 to 6: people (training frames as library)")
-    source = "x" if "x" in p1.seen else "gt"
+    source = "x" if figures.liftable(p1, "x", library) else "gt"
     told.draw("figure2", figures.failure(p1, source, library), "Figure 2: a failure")
     told.draw("figure3", figures.warp(p1, library), "Figure 3: the warp")
     for number, picture in enumerate(figures.typical(p1, source, library)):
         told.draw(f"figure4{'abc'[number]}", picture, "Figure 4: answers")
     for number, given in ((5, "x"), (6, "gt")):
-        if given in p1.seen:
+        if not figures.liftable(p1, given, library):
+            told.missing.append(f"figure {number}: nobody can be lifted given {given}")
+        else:
             for letter, picture in zip("ab", figures.side_by_side(p1, given, library), strict=True):
                 caption = f"Figure {number}: the paper's method and the default, given {given}"
                 told.draw(f"figure{number}{letter}", picture, caption)
@@ -317,12 +334,12 @@ def _noisy(test: TestSet, noise_px: float) -> TestSet:
 
 def _with_videos(
     test: TestSet, videos: dict[tuple[str, str, str, str], Path], told: Report
-) -> TestSet:
-    """The views that videos show, with both kinds of 2D; as it was where there are none."""
+) -> TestSet | None:
+    """The views that videos show, with both kinds of 2D; None where there are none."""
     views, seen, missing = look_at_videos(test.views, videos)
     told.missing += missing
     if not len(views):
-        return test
+        return None
     return TestSet(views, {"gt": Seen2D(views.points_px()), "x": seen}, test.columns)
 
 
@@ -338,6 +355,10 @@ def _lifting_views(path: Path, options: Options) -> TestSet:
     scene = Scene(clip, "all", (SceneCamera("", upright, np.zeros(3), pinhole),))
     views = some(look([scene]), options.views, options.rng())
     return TestSet(views, {"gt": Seen2D(views.points_px())}, ("all",))
+
+
+def _count(test: TestSet | None) -> int:
+    return 0 if test is None else len(test.views)
 
 
 def _what_is_drawn(options: Options) -> str:

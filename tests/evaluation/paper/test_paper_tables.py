@@ -1,0 +1,167 @@
+"""The paper's tables on small folders in the layouts that users have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from evaluation.metrics import rigid_error_mm, root_centred_error_mm
+from evaluation.paper.__main__ import main
+from evaluation.paper.datasets import find_cmu, find_h36m, find_humaneva, h36m_column
+from evaluation.paper.exemplars import exemplars_of, fraction, orbit_rows, write_library
+from evaluation.paper.published import ACTIONS, P1, P1_GT, P2
+from evaluation.paper.systems import Seen2D, known_depths, optimal_exemplars, paper_method
+from evaluation.paper.views import draw, look
+from library_store.cameras import rotations
+from library_store.importers import Clip, write_npz
+from library_store.importers.h36m import H36M_32
+from library_store.importers.rotation import up_to_y
+from tests.evaluation.paper.made_data import (
+    DISTANCE_MM,
+    acting,
+    h36m_npz,
+    humaneva_npz,
+    metadata_xml,
+    video,
+)
+
+SMALL = ("--entries", "1500", "--views", "24", "--curve-views", "8")
+ACTED = ("Directions 1", "Walking", "_ALL")
+
+
+@pytest.fixture(scope="module")
+def users_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("h36m")
+    h36m_npz(folder / "data_3d_h36m.npz", ACTED)
+    humaneva_npz(folder / "data_3d_humaneva15.npz")
+    metadata_xml(folder / "metadata.xml")
+    for camera in ("54138969", "55011271"):
+        video(folder / "S11" / "Videos" / f"Walking.{camera}.mp4", 70)
+    return folder
+
+
+def test_every_table_of_a_users_folder(users_folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    main(["--data", str(users_folder), "--out", str(out), *SMALL])
+    text = (out / "report.md").read_text()
+    for number in range(1, 10):
+        assert f"Table {number}:" in text, number
+    assert "| paper | 71.63 | 66.60 |" in text
+    assert "82.72 | 69.05 |" in text
+    assert "Cameras: the real ones" in text
+    assert "video of S9_Walking, camera" in text
+    assert text.count("action '_ALL': not in the paper") == 1
+    # Nobody is on the made-up films.
+    assert "figure 5: nobody can be lifted given x" in text
+    for name in ("2", "3", "4a", "4c", "6a", "6b", "7", "8"):
+        assert (out / f"figure{name}.svg").read_text().startswith("<svg"), name
+
+
+def test_without_cameras_and_videos_the_rest_is_done(tmp_path: Path) -> None:
+    data, out = tmp_path / "data", tmp_path / "out"
+    data.mkdir()
+    h36m_npz(data / "data_3d_h36m.npz", ("Walking 1",))
+    main(["--data", str(data), "--out", str(out), *SMALL])
+    text = (out / "report.md").read_text()
+    assert "Table 2:" in text
+    assert "Table 1:" not in text
+    missing = text.split("## Missing")[1]
+    for what in ("metadata.xml", "tables 1, 3, 4 and 6", "HumanEva-I: no"):
+        assert what in missing
+
+
+def test_an_empty_folder_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["--data", str(tmp_path), "--out", str(tmp_path / "out")])
+    assert "Human3.6M: no data_3d_h36m.npz" in capsys.readouterr().out
+
+
+def test_tables_of_free_mocap(tmp_path: Path) -> None:
+    clips = []
+    for subject, action in (("cmu_01", "climb"), ("cmu_02", "walk"), ("cmu_35", "run/jog")):
+        joints = acting(90, int(subject[-2:]))[:, H36M_32] @ up_to_y("+Z").T
+        clips.append(
+            Clip(
+                subject, subject, action, 30.0, joints.astype(np.float32), np.arange(90), (), "free"
+            )
+        )
+    mocap = tmp_path / "cmu.npz"
+    write_npz(mocap, clips)
+    out = tmp_path / "out"
+    main(["--data", "cmu", "--mocap", str(mocap), "--out", str(out), *SMALL])
+    text = (out / "report.md").read_text()
+    assert "| | Run | **Avg.** | Median |" in text
+    assert "table 9: no --cross-set" in text
+    assert "CMU subject cmu_05" in text
+    found, held_out = find_cmu(mocap)
+    assert {scene.clip.subject for scene in found.of(held_out)} == {"cmu_35"}
+
+
+def test_real_cameras_see_the_person_where_they_stand(users_folder: Path) -> None:
+    found = find_h36m(users_folder)
+    views = look(found.of(["S11"]))
+    assert np.abs(views.joints_mm[..., 2] - DISTANCE_MM).max() < 1500
+    # Upright, in the middle of a 1000 pixel picture.
+    points = views.points_px()
+    assert (points[:, 0, 1] < points[:, 10, 1]).all()
+    assert ((points > 0) & (points < 1000)).all()
+    humaneva = find_humaneva(users_folder)
+    assert {scene.clip.subject for scene in humaneva.scenes} == {"Validate/S1", "Validate/S2"}
+
+
+def test_a_library_of_views_knows_them(users_folder: Path, tmp_path: Path) -> None:
+    """1NN with true 2D finds the very exemplar; its camera, turned onto it, is the view's."""
+    train = find_h36m(users_folder).of(["S1", "S5"])
+    views = draw(train, 400, np.random.default_rng(0))
+    library = write_library(tmp_path / "frames", exemplars_of(views))
+    seen = Seen2D(views.points_px())
+    found = paper_method(library, 1)(views, seen)
+    assert found.exemplar_mm is not None
+    assert np.median(root_centred_error_mm(found.exemplar_mm, views.joints_mm)) < 0.5
+    best = optimal_exemplars(library, views)
+    assert rigid_error_mm(best, views.joints_mm).max() < 0.5
+    # Known depths leave what weak perspective costs.
+    bound = rigid_error_mm(known_depths(views, seen), views.joints_mm).mean()
+    assert 0 < bound < 30
+    part = write_library(tmp_path / "part", fraction(library, 50, 3))
+    assert len(part) == 50
+    assert part.match(library.descriptors([0]).reshape(1, 14, 2), None, 1).entries.shape == (1, 1)
+
+
+def test_orbit_rows_invert_rotations() -> None:
+    rng = np.random.default_rng(0)
+    rows = np.stack(
+        [
+            rng.uniform(-180, 180, 50),
+            rng.uniform(-80, 80, 50),
+            rng.uniform(-170, 170, 50),
+            rng.uniform(2000, 8000, 50),
+        ],
+        axis=1,
+    )
+    np.testing.assert_allclose(orbit_rows(rotations(rows), rows[:, 3]), rows, rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("spelt", "column"),
+    [
+        ("WalkingDog 1", "WalkDog"),
+        ("TakingPhoto", "Photo"),
+        ("SittingDown 2", "SitDown"),
+        ("Sitting 1", "Sit"),
+        ("WalkTogether", "WalkPair"),
+        ("Walking 1.54138969", "Walk"),
+        ("_ALL", None),
+    ],
+)
+def test_actions_however_they_are_spelt(spelt: str, column: str | None) -> None:
+    assert h36m_column(spelt) == column
+
+
+def test_the_papers_rows_are_whole() -> None:
+    for row in (*P1, *P1_GT, *P2):
+        assert len(row.actions) in (0, len(ACTIONS)), row.label
+    # Averages are per frame, not of the actions' means, but near them.
+    for row in (P1[-1], P1_GT[-1], P2[-1]):
+        assert row.mean == pytest.approx(np.mean(row.actions), rel=0.05)
