@@ -1,0 +1,177 @@
+"""Finding people: recall, precision, duplicates and false alarms, of the boxes and of the answer.
+
+    python -m evaluation.people --data DIR --labels FILE [--seed 0]
+
+``--data`` has ``photos_scenes.tar``, ``photos_*.tar`` and ``lspet_val.tar``; ``--labels`` is what
+``models.training.label_scenes`` wrote of the scenes. All of it was held out from training: one
+scene in eight, mosaics of held-out people (exact boxes), patches of held-out scenes with nobody.
+"Answered" are the people left after the pose network's second thoughts (models/presence.py).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from models import PersonBox, PersonDetector, PoseEstimator
+from models.person_detector import Floats, iou
+from models.presence import present
+from models.training.dataset import Image, decode_members, held_out, load
+from models.training.scenes import mosaic
+
+HELD_OUT_ONE_IN = 8
+SURE = 0.7
+"""Teacher's score from which a box has to be found; surer and unsurer ones excuse a box."""
+SAME, STRANGE = 0.5, 0.3
+"""Overlap (IoU) from which two boxes are of one person, and up to which of nobody known."""
+LEAST_HEIGHT_PX = 60.0
+MOST_PEOPLE = 10
+MOSAICS, EMPTY = 200, 200
+MOSAIC_SIZE = (640, 480)
+
+Find = Callable[[Image], list[PersonBox]]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A picture, the boxes to be found (n, 4) and all that excuse one (m, 4), corners in px."""
+
+    image: Image
+    wanted: Floats
+    known: Floats
+
+
+@dataclass(frozen=True)
+class Counts:
+    """What was found in a set of scenes."""
+
+    scenes: int
+    wanted: int
+    found: int
+    boxes: int
+    strange: int
+    duplicates: int
+
+    def row(self, name: str) -> str:
+        """A line of the table."""
+        recall = f"{100 * self.found / self.wanted:.1f}" if self.wanted else "-"
+        precision = f"{100 * (1 - self.strange / self.boxes):.1f}" if self.boxes else "-"
+        return (
+            f"| {name} | {self.scenes} | {self.wanted} | {recall} | {precision} "
+            f"| {self.duplicates} | {self.strange / self.scenes:.3f} |"
+        )
+
+
+def corners(boxes: list[PersonBox]) -> Floats:
+    """(n, 4) x0, y0, x1, y1."""
+    rows = [(b.x_px, b.y_px, b.x_px + b.width_px, b.y_px + b.height_px) for b in boxes]
+    return np.array(rows, np.float64).reshape(-1, 4)
+
+
+def count(find: Find, scenes: list[Scene], label: str) -> Counts:
+    """Run ``find`` over scenes. A duplicate is a further box of somebody found already."""
+    found = wanted = total = strange = duplicates = 0
+    for scene in track(scenes, label, transient=True, console=Console(stderr=True)):
+        boxes = corners(find(scene.image))
+        overlap = iou(boxes, scene.wanted)
+        found += int((overlap.max(0, initial=0) > SAME).sum())
+        wanted += len(scene.wanted)
+        total += len(boxes)
+        strange += int((iou(boxes, scene.known).max(1, initial=0) < STRANGE).sum())
+        duplicates += int(np.clip((overlap > SAME).sum(0) - 1, 0, None).sum())
+    return Counts(len(scenes), wanted, found, total, strange, duplicates)
+
+
+def tall(boxes: Floats) -> Floats:
+    """Those of at least LEAST_HEIGHT_PX."""
+    return boxes[boxes[:, 3] - boxes[:, 1] >= LEAST_HEIGHT_PX]
+
+
+def teacher_scenes(images: dict[str, Image], labels: Path) -> list[Scene]:
+    """Held-out scenes with the teacher's boxes."""
+    scenes = []
+    for record in json.loads(labels.read_text())[::HELD_OUT_ONE_IN]:
+        people = np.array(record["people"], np.float64).reshape(-1, 5)
+        sure = tall(people[people[:, 4] >= SURE, :4])
+        scenes.append(Scene(images[record["image"]], sure, people[:, :4]))
+    return scenes
+
+
+def empty_patches(scenes: list[Scene], rng: np.random.Generator) -> list[Image]:
+    """Patches of scenes that touch no known box, at most eight a scene, in random order."""
+    patches: list[Image] = []
+    for scene in scenes:
+        height, width = scene.image.shape[:2]
+        kept = 0
+        for _ in range(400):
+            w, h = (int(v) for v in rng.uniform(0.25, 0.9, 2) * (width, height))
+            x, y = int(rng.integers(0, width - w + 1)), int(rng.integers(0, height - h + 1))
+            low = np.maximum(scene.known[:, :2], (x, y))
+            high = np.minimum(scene.known[:, 2:], (x + w, y + h))
+            if (high > low).all(1).any():
+                continue
+            patches.append(scene.image[y : y + h, x : x + w])
+            kept += 1
+            if kept == 8:
+                break
+    order: NDArray[np.int64] = rng.permutation(len(patches))
+    return [patches[i] for i in order]
+
+
+def finders() -> dict[str, Find]:
+    """The person network alone, and what the service would answer."""
+    detector, estimator = PersonDetector("person-int8"), PoseEstimator("cpm-int8")
+
+    def answered(image: Image) -> list[PersonBox]:
+        boxes = detector.detect(image, MOST_PEOPLE)
+        return [boxes[i] for i in present(boxes, estimator.estimate(image, boxes))]
+
+    return {"boxes": lambda image: detector.detect(image, MOST_PEOPLE), "answered": answered}
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--labels", type=Path, required=True)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    rng = np.random.default_rng(args.seed)
+    scenes = teacher_scenes(decode_members(args.data / "photos_scenes.tar"), args.labels)
+    empty = empty_patches(scenes, rng)
+    people = load(args.data / "lspet_val.tar")
+    for name in ("photos_a", "photos_b"):
+        people += [crop for crop in load(args.data / f"{name}.tar") if held_out(crop)]
+    mosaics: list[Scene] = []
+    while len(mosaics) < MOSAICS:
+        made = mosaic(people, empty, MOSAIC_SIZE, rng)
+        boxes = made.boxes.astype(np.float64)
+        if len(boxes):
+            mosaics.append(Scene(made.image, tall(boxes), boxes))
+    nobody = np.empty((0, 4))
+    sets = {
+        "held-out scenes, teacher's boxes": scenes,
+        "mosaics, exact boxes": mosaics,
+        "patches without people": [Scene(p, nobody, nobody) for p in empty[:EMPTY]],
+    }
+    print(
+        "| set: of what | scenes | people | recall, % | precision, % | duplicates | strange/scene |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    for title, chosen in sets.items():
+        for who, find in finders().items():
+            print(count(find, chosen, title).row(f"{title}: {who}"), flush=True)
+
+
+if __name__ == "__main__":
+    main()
