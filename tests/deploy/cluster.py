@@ -1,0 +1,155 @@
+"""A Ray cluster of one machine for tests, in processes of its own, and posematch on it."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import httpx
+import yaml
+
+from tests.app.server import free_port
+
+ROOT = Path(__file__).parents[2]
+CONFIG = ROOT / "deploy" / "ray_serve.yaml"
+REPLICA = b"ray::ServeReplica:posematch:posematch"
+PATIENCE_S = 100.0
+# An address of this machine that Ray does not take for a laptop's own.
+_NODE = "127.0.0.2"
+
+
+def wait_until(done: Callable[[], bool], what: str) -> None:
+    """Ask every now and then; fails after ``PATIENCE_S``."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not done():
+        assert time.monotonic() < deadline, f"waited {PATIENCE_S:g} s in vain: {what}"
+        time.sleep(0.2)
+
+
+class Cluster:
+    """Runs ``ray start --head`` for the time of a ``with`` block; ``bin`` is Ray's environment."""
+
+    def __init__(self, bin_dir: Path, log: Path) -> None:
+        self._bin = bin_dir
+        self._log = log
+        self._gcs_port = free_port()
+        self.port = free_port()
+        self.url = f"http://127.0.0.1:{self.port}"
+
+    def __enter__(self) -> Self:
+        # Not pytest's: the paths of Ray's sockets have to be short.
+        self._directory = Path(tempfile.mkdtemp(prefix="ray-"))
+        inherited = {
+            k: v for k, v in os.environ.items() if not k.startswith(("POSEMATCH_", "RAY_"))
+        }
+        # Marks every process of this cluster, so that those of another are left alone.
+        self._environment = {**inherited, "RAY_TMPDIR": str(self._directory)}
+        command = [
+            *(str(self._bin / "ray"), "start", "--head", "--block", "--num-cpus=2"),
+            *("--include-dashboard=false", "--disable-usage-stats"),
+            *("--object-store-memory=100000000", f"--node-ip-address={_NODE}"),
+            *(f"--port={self._gcs_port}", f"--ray-client-server-port={free_port()}"),
+            f"--temp-dir={self._directory}",
+        ]
+        with self._log.open("w") as log:
+            self._process = subprocess.Popen(
+                command, cwd=ROOT, env=self._environment, stdout=log, stderr=log
+            )
+        try:
+            wait_until(self._has_started, "ray start")
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def _has_started(self) -> bool:
+        log = self._log.read_text()
+        assert self._process.poll() is None, log
+        return "Ray runtime started" in log
+
+    def deploy(self, *, replicas: int, **settings: object) -> None:
+        """``serve run`` what deploy/ray_serve.yaml says, with these settings; does not wait."""
+        config = yaml.safe_load(CONFIG.read_text())
+        config["http_options"]["port"] = self.port
+        (application,) = config["applications"]
+        variables = application["runtime_env"]["env_vars"]
+        variables |= {f"POSEMATCH_{key.upper()}": str(value) for key, value in settings.items()}
+        (deployment,) = application["deployments"]
+        bounds = {"min_replicas": replicas, "max_replicas": replicas}
+        deployment["autoscaling_config"] |= bounds
+        path = self._directory / "config.yaml"
+        path.write_text(yaml.safe_dump(config))
+        address = f"{_NODE}:{self._gcs_port}"
+        command = [
+            *(str(self._bin / "serve"), "run", "--non-blocking"),
+            *("--address", address, str(path)),
+        ]
+
+        subprocess.run(
+            command,
+            cwd=ROOT,
+            env=self._environment,
+            check=True,
+            capture_output=True,
+            timeout=PATIENCE_S,
+        )
+
+    def replicas(self) -> set[int]:
+        """The process ids of the replicas that run or are being started."""
+        return {pid for pid in self._members() if _read(pid, "cmdline").startswith(REPLICA)}
+
+    def answering(self, asked: int = 12) -> dict[str, int]:
+        """Which replicas answer /metrics: when each started -> how many photos it has answered."""
+        seen = {}
+        for _ in range(asked):
+            try:
+                text = httpx.get(f"{self.url}/metrics", timeout=30).text
+            except httpx.TransportError:
+                continue
+            started = re.search(r"^process_start_time_seconds (\S+)", text, re.MULTILINE)
+            photos = re.search(
+                r'^posematch_requests_total{[^}]*route="/v1/poses",status="200"} (\S+)',
+                text,
+                re.MULTILINE,
+            )
+            if started:
+                seen[started[1]] = int(float(photos[1])) if photos else 0
+        return seen
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._end()
+
+    def _end(self) -> None:
+        # SIGTERM would have Ray wait half a minute for its actors.
+        for pid in self._members():
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self._process.wait(timeout=10)
+        shutil.rmtree(self._directory, ignore_errors=True)
+
+    def _members(self) -> set[int]:
+        mark = b"RAY_TMPDIR=" + os.fsencode(self._directory)
+        pids = (int(path.name) for path in Path("/proc").glob("[0-9]*"))
+        return {pid for pid in pids if mark in _read(pid, "environ").split(b"\0")}
+
+
+def _read(pid: int, name: str) -> bytes:
+    try:
+        return Path(f"/proc/{pid}/{name}").read_bytes()
+    except OSError:
+        return b""  # it has ended
