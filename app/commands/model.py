@@ -161,6 +161,12 @@ def finetune(
         Path | None,
         typer.Option(exists=True, file_okay=False, help="Human3.6M: S*/MyPoseFeatures, S*/Videos."),
     ] = None,
+    subject: Annotated[
+        list[str] | None, typer.Option(help="Of Human3.6M, like S1; several; default: all.")
+    ] = None,
+    frames_apart: Annotated[
+        int, typer.Option(min=1, help="Every so many frames of Human3.6M, which has 50 a second.")
+    ] = 25,
     start: Annotated[str, typer.Option(help="Card to start from (fp32).")] = "cpm",
     name: Annotated[str, typer.Option(help="Of the new card.")] = "finetuned",
     steps: Annotated[int, typer.Option(min=1)] = 500,
@@ -194,7 +200,8 @@ def finetune(
             crops, source = read_coco(coco, images), f"{coco.name} (the user's own labels)"
         else:
             assert human36m is not None
-            crops, source = read_human36m(human36m), "Human3.6M (academic use only)"
+            crops = read_human36m(human36m, tuple(subject or ()), frames_apart)
+            source = f"Human3.6M, {', '.join(subject or ['all subjects'])} (academic use only)"
         result = training.finetune(
             crops,
             weights_dir=settings.weights_dir,

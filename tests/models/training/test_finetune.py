@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
+from app.cli import cli  # noqa: E402
 from models import ModelError, PoseEstimator  # noqa: E402
 from models.card import WEIGHTS_DIR  # noqa: E402
 from models.errors import AnnotationError  # noqa: E402
@@ -54,6 +57,25 @@ def test_it_learns_a_users_people_and_serves_by_card(start: Path, tmp_path: Path
     estimator = PoseEstimator("ours", weights_dir=tmp_path / "out")
     joints = estimator.estimate(np.zeros((80, 80, 3), np.uint8), [PersonBox(8, 8, 60, 60, 1.0)])
     assert joints[0].positions_px.shape == (14, 2)
+
+
+def test_human36m_by_the_command_holds_out_whole_clips(
+    start: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "h36m"
+    for i in range(4):
+        pose = user_files.human36m_clip(root, f"Walking {i}", 20)
+        np.savez(root / "S1" / "MyPoseFeatures" / "D2_Positions" / f"Walking {i}.npz", Pose=pose)
+    for file in WEIGHTS_DIR.glob("person.*"):
+        shutil.copy(file, start)
+    monkeypatch.setenv("POSEMATCH_WEIGHTS_DIR", str(start))
+    arguments = ["--human36m", root, "--subject", "S1", "--frames-apart", 2, "--start", "start"]
+    arguments += ["--out", tmp_path / "out", "--name", "studio", "--steps", 3, "--threads", 1]
+    result = CliRunner().invoke(cli, ["model", "finetune", *map(str, arguments)])
+    assert result.exit_code == 0, result.exception
+    assert "30 people trained on, 10 held out" in result.stdout
+    assert "Human3.6M, S1 (academic use only)" in (tmp_path / "out" / "studio.json").read_text()
+    assert (tmp_path / "out" / "person.onnx").exists(), "the directory can be served"
 
 
 def test_what_cannot_be_trained_on_is_refused(tmp_path: Path) -> None:

@@ -124,26 +124,8 @@ def human36m(tmp_path: Path) -> Path:
     from cdflib import cdfwrite
 
     root = tmp_path / "h36m"
+    pose = user_files.human36m_clip(root, "Walking 1.54138969", N_FRAMES)
     poses = root / "S1" / "MyPoseFeatures" / "D2_Positions"
-    videos = root / "S1" / "Videos"
-    poses.mkdir(parents=True)
-    videos.mkdir()
-    pose = np.full((N_FRAMES, 32, 2), 50.0)
-    order = {13: "nose", 17: "left_shoulder", 18: "left_elbow", 19: "left_wrist"}
-    order |= {25: "right_shoulder", 26: "right_elbow", 27: "right_wrist", 1: "right_hip"}
-    order |= {2: "right_knee", 3: "right_ankle", 6: "left_hip", 7: "left_knee", 8: "left_ankle"}
-    order |= {15: "nose"}
-    writer = cv2.VideoWriter(
-        str(videos / "Walking 1.54138969.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 50, (320, 240)
-    )
-    for i in range(N_FRAMES):
-        at = {n: user_files.place(n, 80 + 5 * i, 120, 1.0) for n in user_files.NAMES}
-        image = np.zeros((240, 320, 3), np.uint8)
-        user_files.draw(image, at)
-        writer.write(image)
-        for index, name in order.items():
-            pose[i, index] = at[name]
-    writer.release()
     out = cdfwrite.CDF(str(poses / "Walking 1.54138969.cdf"), cdf_spec={"Compressed": 0})
     out.write_var(
         {

@@ -75,6 +75,32 @@ def coco(folder: Path, n_images: int = 3, size: tuple[int, int] = (320, 240)) ->
     return records
 
 
+H36M = {13: "nose", 15: "nose", 17: "left_shoulder", 18: "left_elbow", 19: "left_wrist"}
+H36M |= {25: "right_shoulder", 26: "right_elbow", 27: "right_wrist", 1: "right_hip"}
+H36M |= {2: "right_knee", 3: "right_ankle", 6: "left_hip", 7: "left_knee", 8: "left_ankle"}
+"""Which of Human3.6M's 32 joints the figure has."""
+
+
+def human36m_clip(root: Path, name: str, n_frames: int) -> np.ndarray:
+    """Write the video of S1 walking to the right; returns the poses (F, 32, 2) in pixels."""
+    (root / "S1" / "MyPoseFeatures" / "D2_Positions").mkdir(parents=True, exist_ok=True)
+    videos = root / "S1" / "Videos"
+    videos.mkdir(exist_ok=True)
+    pose = np.full((n_frames, 32, 2), 50.0)
+    writer = cv2.VideoWriter(
+        str(videos / f"{name}.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 50, (320, 240)
+    )
+    for i in range(n_frames):
+        at = {n: place(n, 80 + 5 * i, 120, 1.0) for n in NAMES}
+        image = np.zeros((240, 320, 3), np.uint8)
+        draw(image, at)
+        writer.write(image)
+        for index, joint in H36M.items():
+            pose[i, index] = at[joint]
+    writer.release()
+    return pose
+
+
 def write(path: Path, records: dict[str, Any]) -> Path:
     path.write_text(json.dumps(records))
     return path
