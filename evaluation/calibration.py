@@ -1,10 +1,11 @@
 """Fit the lifter's calibration constants, and check them on people they were not fitted on.
 
-    python -m evaluation.calibration --library DIR --data heldout.npz [--check other.npz]
+    python -m evaluation.calibration --library DIR --data heldout.npz [--check LIBRARY other.npz]
 
 Constants are fitted on the even-numbered people of ``--data`` at all its noise levels together and
-checked on the odd-numbered ones and on ``--check``; the library must not hold these people. Prints
-``SigmaCalibration`` for ``app.lifting.calibration`` and σ(library), σ(2D) of eq. 4 for
+checked on the odd-numbered ones and on ``--check``; the libraries must not hold these people.
+Prints ``SigmaCalibration`` for ``app.lifting.calibration``, how often candidates of a given
+``probability`` are truly the nearest, and with ``--search`` what σ(library) of eq. 4 is best for
 ``LiftingSettings``.
 """
 
@@ -27,6 +28,7 @@ from library_store.library import Library, load
 COVERAGE = 0.68
 LIBRARY_SIGMAS_PX = (10.0, 15.0, 20.0, 30.0, 40.0, 55.0, 80.0)
 STATED_FLOOR_PX = 0.5
+PROBABILITY_EDGES = (0.0, 0.02, 0.04, 0.06, 0.08, 0.12, 1.0)
 FLOORS_MM = (0.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0)
 
 
@@ -85,6 +87,29 @@ def log_score(lifted: Lifted, truth: Floats) -> Floats:
     return np.array(scores)
 
 
+def report_probability(label: str, lifted: Lifted, truth: Floats) -> None:
+    """Print, by ``probability``, the share of candidates that are truly nearest (P1), and the ECE.
+
+    The expected calibration error is the mean distance of the two, weighted by what candidates of
+    that probability claim or take of the nearest ones.
+    """
+    claimed, nearest = [], []
+    for person, pose in zip(lifted.people, truth, strict=True):
+        joints = np.stack([candidate.joints_mm for candidate in person.candidates])
+        best = int(np.argmin(rigid_error_mm(joints, pose[None]).mean(1)))
+        claimed.append([candidate.probability for candidate in person.candidates])
+        nearest.append(np.arange(len(joints)) == best)
+    probability, hit = np.concatenate(claimed), np.concatenate(nearest)
+    cell = np.digitize(probability, PROBABILITY_EDGES[1:-1])
+    rows, gap = [], 0.0
+    for number in range(len(PROBABILITY_EDGES) - 1):
+        of = cell == number
+        if of.any():
+            rows.append(f"{probability[of].mean():.3f} -> {hit[of].mean():.3f} ({of.sum()})")
+            gap += abs(float(probability[of].sum()) - float(hit[of].sum())) / len(truth)
+    print(f"{label}: claimed -> nearest (candidates): {', '.join(rows)}; error {gap:.3f}")
+
+
 def mean_log_score(
     library: Library, data: LiftingSet, settings: LiftingSettings, *, stated: bool
 ) -> Floats:
@@ -124,7 +149,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="evaluation.calibration", description=__doc__)
     parser.add_argument("--library", type=Path, required=True)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--check", type=Path, action="append", default=[])
+    parser.add_argument(
+        "--check",
+        type=Path,
+        nargs=2,
+        metavar=("LIBRARY", "DATA"),
+        action="append",
+        default=[],
+        help="another library and set to check on",
+    )
+    parser.add_argument("--search", action="store_true", help="try other values of eq. 4's sigma")
     parser.add_argument("--people", type=int, default=None, help="only the first N of each set")
     chosen = parser.parse_args(arguments)
     library, settings = load(chosen.library), LiftingSettings()
@@ -135,10 +169,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(calibration)
     report_coverage("fitted half", calibration, [half[0] for half in halves])
     report_coverage("other half", calibration, [half[1] for half in halves])
-    for path in chosen.check:
-        other = load_lifting_set(path).first(chosen.people)
-        report_coverage(other.name, calibration, collect_errors(library, other, settings))
+    _check_probability(library, data.half(1), settings)
+    for directory, path in chosen.check:
+        other, elsewhere = load(directory), load_lifting_set(path).first(chosen.people)
+        report_coverage(elsewhere.name, calibration, collect_errors(other, elsewhere, settings))
+        _check_probability(other, elsewhere, settings)
+    if chosen.search:
+        _search(library, data, settings)
 
+
+def _check_probability(library: Library, data: LiftingSet, settings: LiftingSettings) -> None:
+    lifter = Lifter(library, settings)
+    for noise, points in data.joints_2d_px.items():
+        observations = list(clean(points).observations())
+        answers = lifter.lift(observations, data.intrinsics, n_candidates=settings.shortlist)
+        lifted = Lifted.of(answers, cpu_ms=0.0)
+        report_probability(f"{data.name}, {noise} px", lifted, data.joints_3d_mm)
+
+
+def _search(library: Library, data: LiftingSet, settings: LiftingSettings) -> None:
     fit, check = data.half(0), data.half(1)
     for stated in (True, False):
         print("2D noise stated:" if stated else "2D noise unknown:")

@@ -55,11 +55,15 @@ def test_calibration_prints_its_constants(
 ) -> None:
     monkeypatch.setattr(calibration, "LIBRARY_SIGMAS_PX", (30.0,))
     calibration.main(
-        ["--library", str(library_directory), "--data", str(data), "--check", str(data)]
+        [
+            *("--library", str(library_directory), "--data", str(data), "--search"),
+            *("--check", str(library_directory), str(data)),
+        ]
     )
     printed = capsys.readouterr().out
     assert "SigmaCalibration(factors=" in printed
     assert "log P" in printed
+    assert printed.count("claimed -> nearest") == 4
 
 
 def test_spoiling_touches_one_joint(data: Path) -> None:
