@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from app.errors import StartupError
+from app.errors import LibraryUnavailableError, StartupError
 from app.lifting.lifter import Lifter, LiftingSettings
 from app.pipeline import PhotoQuery, Pipeline
 from app.settings import Settings
@@ -144,14 +144,20 @@ def _assemble(
 
 
 def _warm_up(pipeline: Pipeline) -> float:
-    """Run every stage a few times on a made-up photo; returns the fastest run in seconds."""
+    """Run every stage a few times on a made-up photo; returns the fastest run in seconds.
+
+    Raises ``StartupError`` when the library's index does not answer.
+    """
     noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), np.uint8)
     _, encoded = cv2.imencode(".jpg", cv2.GaussianBlur(noise, (0, 0), 5))
     data = encoded.tobytes()
     durations_s = []
     for _ in range(_WARM_UP_RUNS):
         started_s = time.perf_counter()
-        pipeline.estimate(data, PhotoQuery(max_people=1))
-        pipeline.estimate(data, PhotoQuery(box_px=(220.0, 40.0, 200.0, 400.0)))
+        try:
+            pipeline.estimate(data, PhotoQuery(max_people=1))
+            pipeline.estimate(data, PhotoQuery(box_px=(220.0, 40.0, 200.0, 400.0)))
+        except LibraryUnavailableError as error:
+            raise StartupError(str(error.__cause__)) from error
         durations_s.append(time.perf_counter() - started_s)
     return min(durations_s)

@@ -17,6 +17,7 @@
         ├── InvalidInputError            422
         ├── QuotaExceededError           429
         ├── OverloadedError              503
+        ├── LibraryUnavailableError      503
         └── NotReadyError                503
 
 ``RequestError.detail`` is written for the client. What only the log may know goes into the
@@ -215,6 +216,20 @@ class OverloadedError(RequestError):
             headers={"Retry-After": str(retry_after_s)},
         )
         self.reason = reason
+
+
+class LibraryUnavailableError(RequestError):
+    """The engine that searches the library does not answer; it may well do so in a moment."""
+
+    status = 503
+    slug = "library-unavailable"
+    title = "Library unavailable"
+
+    def __init__(self, retry_after_s: int) -> None:
+        super().__init__(
+            f"the library's index does not answer; try again in {retry_after_s} s",
+            headers={"Retry-After": str(retry_after_s)},
+        )
 
 
 class NotReadyError(RequestError):

@@ -36,7 +36,7 @@ class Breaker:
             if self._failures > self._tolerated:
                 now_s = time.monotonic()
                 if now_s < self._next_try_s:
-                    raise self._refusal("is away")
+                    raise self.refusal("is away")
                 # This call finds out for all the others, which are refused meanwhile.
                 self._next_try_s = now_s + self._pause_s
         try:
@@ -45,10 +45,11 @@ class Breaker:
             with self._lock:
                 self._failures += 1
                 self._next_try_s = time.monotonic() + self._pause_s
-            raise self._refusal(f"does not answer: {error}") from error
+            raise self.refusal(f"does not answer: {error}") from error
         with self._lock:
             self._failures = 0
         return result
 
-    def _refusal(self, what: str) -> IndexUnavailableError:
+    def refusal(self, what: str) -> IndexUnavailableError:
+        """That the engine is away, in the words given."""
         return IndexUnavailableError(f"{self._name} {what}", self._pause_s)

@@ -12,6 +12,7 @@ Reads have Bounded consistency: a library does not change once it is pushed.
 
 from __future__ import annotations
 
+import logging
 import re
 import time
 from collections.abc import Callable
@@ -95,7 +96,7 @@ class MilvusIndex:
         k = self._clamped(k)
         if not len(queries):
             return stack([], k)
-        found = self._search(queries, min(k + SPARE, self._n))
+        found = self._search(queries, min(k + SPARE, self._n), least=k)
         return stack(
             [
                 nearest_of(self._describe(entries), entries, query, k)
@@ -118,10 +119,13 @@ class MilvusIndex:
         if not guessed:
             return stack([], k)
         limit = min(max(k, _PER_GUESS) + SPARE, self._n)
-        found = iter(self._search(np.concatenate(guessed), limit))
+        # A guess off the beaten track may reach fewer neighbours through the graph than others.
+        found = iter(self._search(np.concatenate(guessed), limit, least=1))
         answers = []
         for query, share, own in zip(queries, weights, guessed, strict=True):
             entries = np.unique(np.concatenate([next(found) for _ in own]))
+            if len(entries) < k:
+                raise self._breaker.refusal(f"found {len(entries)} instead of {k} exemplars")
             table = self._describe(entries)
             answers.append(nearest_masked(table, entries, query, share, k))
         return stack(answers, k)
@@ -135,8 +139,11 @@ class MilvusIndex:
             raise ValueError(f"Milvus gives at most {LARGEST_LIMIT - SPARE} neighbours, not {k}")
         return min(k, self._n)
 
-    def _search(self, queries: Descriptors, limit: int) -> list[Entries]:
-        """The ``limit`` nearest entries of each query (Q, 28), approximately."""
+    def _search(self, queries: Descriptors, limit: int, *, least: int) -> list[Entries]:
+        """At most ``limit`` nearest entries of each query (Q, 28), approximately.
+
+        ``IndexUnavailableError`` when they are fewer than ``least``.
+        """
 
         def work() -> list[Entries]:
             hits = self._client.search(
@@ -149,7 +156,7 @@ class MilvusIndex:
                 timeout=self._timeout_s,
             )
             found = [np.asarray(one.ids, dtype=np.int64) for one in hits]
-            if any(len(entries) < limit for entries in found):
+            if any(len(entries) < least for entries in found):
                 # Milvus just started has no rows, or not all of them, yet.
                 raise IncompleteError(f"{self._collection} is not wholly loaded")
             return found
@@ -203,7 +210,15 @@ def connect(settings: MilvusSettings) -> Any:
         raise LibraryError(
             "a library in Milvus needs the package pymilvus: pip install 'posematch[milvus]'"
         ) from None
-    return MilvusClient(uri=settings.uri, token=settings.token, timeout=settings.start_timeout_s)
+    # It logs every failure with a traceback; they are raised too, and ours to report.
+    logging.getLogger("pymilvus").setLevel(logging.CRITICAL)
+    return MilvusClient(
+        uri=settings.uri,
+        token=settings.token,
+        timeout=settings.start_timeout_s,
+        # Found again seconds after it comes back; by default that may take two minutes.
+        grpc_options={"grpc.max_reconnect_backoff_ms": 2_000},
+    )
 
 
 def failures() -> tuple[type[Exception], ...]:

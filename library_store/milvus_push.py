@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -39,7 +40,7 @@ BATCH = 10_000
 """Entries in one call: 1.2 MB."""
 
 _TIMEOUT_S = 60.0
-_PATIENCE_S = 180.0
+PATIENCE_S = 180.0
 """How long a call is tried again while Milvus is away: a restart takes less."""
 _POLL_S = 1.0
 
@@ -65,21 +66,19 @@ def push_library(
     manifest = read_manifest(directory)
     check_files(directory, manifest, sums=True)
     table = open_table(directory / "descriptors.npy").astype(np.float32, copy=False)
-    client = patiently(connect, settings)
+    collection = collection_name(manifest)
     try:
-        collection = collection_name(manifest)
-        resumed = prepare(client, collection)
-        n_before = write(
-            client, collection, table, resumed, lambda done: report("descriptors", done)
-        )
-        finish(client, collection, len(table), lambda done: report("index", done))
+        with closing(patiently(connect, settings)) as client:
+            resumed = prepare(client, collection)
+            n_before = write(
+                client, collection, table, resumed, lambda done: report("descriptors", done)
+            )
+            finish(client, collection, len(table), lambda done: report("index", done))
     except failures() as error:
         raise LibraryError(
             f"Milvus at {settings.uri} does not answer ({error}); push again when it does: what "
             "is there is passed over"
         ) from error
-    finally:
-        client.close()
     return Pushed(collection, len(table), n_before)
 
 
@@ -152,7 +151,7 @@ def finish(client: Any, collection: str, n: int, progress: Callable[[float], Non
 
 def patiently(call: Callable[..., T], *arguments: Any, **named: Any) -> T:
     """The result of a call, tried again with backoff for a few minutes while Milvus is away."""
-    deadline_s = time.monotonic() + _PATIENCE_S
+    deadline_s = time.monotonic() + PATIENCE_S
     pause_s = 0.5
     while True:
         try:

@@ -14,7 +14,13 @@ from pydantic import BaseModel, ValidationError
 from starlette.exceptions import HTTPException
 
 from app.admission import ClientGoneError
-from app.errors import PROBLEM_TYPE_PREFIX, InvalidInputError, OverloadedError, RequestError
+from app.errors import (
+    PROBLEM_TYPE_PREFIX,
+    InvalidInputError,
+    LibraryUnavailableError,
+    OverloadedError,
+    RequestError,
+)
 from app.schemas import Problem
 
 logger = logging.getLogger("posematch")
@@ -69,6 +75,8 @@ async def _on_request_error(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestError)
     if isinstance(error, OverloadedError):
         request.app.state.service.metrics.refused.labels(error.reason).inc()
+    if isinstance(error, LibraryUnavailableError):
+        request.app.state.service.metrics.refused.labels("library").inc()
     if error.__cause__ is not None:
         logger.info(
             "%s: %s",

@@ -1,4 +1,4 @@
-"""``posematch library``: import mocap, build, merge, describe, check and look at pose libraries."""
+"""``posematch library``: import mocap; build, merge, push, check and look at pose libraries."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from app.commands.console import build_if_missing, notices, output, stage_progress
+from app.engine import milvus_of
 from app.settings import load_settings
 from library_store.backends import IndexSettings
 from library_store.build import (
@@ -28,6 +29,7 @@ from library_store.importers import Clip, read_each, states_licence, write_npz
 from library_store.library import load
 from library_store.manifest import Manifest
 from library_store.merge import merge_libraries
+from library_store.milvus_push import push_library
 from library_store.mocap import MocapSettings
 from library_store.prior import DEFAULT_PRIOR, PosePrior
 from library_store.sheet import contact_sheet, draw_entries
@@ -188,6 +190,32 @@ def merge(
         raise typer.BadParameter(str(error), param_hint="--name") from error
     _print_licences(manifest)
     output.print(str(directory), highlight=False, soft_wrap=True)
+
+
+@commands.command("push")
+def push(
+    library: LibraryArgument = None,
+    uri: Annotated[str, typer.Option(help="Where Milvus is; default POSEMATCH_MILVUS_URI.")] = "",
+) -> None:
+    """Bring a library into Milvus, indexed and loaded.
+
+    Killed, it goes on where it was when it is started again; what is there is not sent twice.
+    """
+    settings = load_settings()
+    if uri:
+        settings = settings.model_copy(update={"milvus_uri": uri})
+    milvus = milvus_of(settings)
+    if milvus is None:
+        raise typer.BadParameter("or POSEMATCH_MILVUS_URI must be given", param_hint="--uri")
+    directory = library or build_if_missing(settings)
+    with stage_progress() as report:
+        pushed = push_library(directory, milvus, report)
+    output.print(
+        f"{pushed.collection}: {pushed.n_entries} exemplars, {pushed.n_before} of them were there",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
 
 
 @commands.command("info")
