@@ -79,7 +79,7 @@ def train(library: Library, width: int, n_blocks: int, minutes: float, seed: int
         for group in optimiser.param_groups:
             group["lr"] = 1e-3 * min(1.0, (step + 1) / 500, 1.6 * (1.0 - spent))
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            found = _forward(parameters, n_blocks, inputs)
+            found = forward(parameters, n_blocks, inputs)
         difference = found.float().view(-1, N_JOINTS, 3) - wanted
         loss = torch.sqrt((difference**2).sum(-1) + 1e-8).mean()
         optimiser.zero_grad()
@@ -133,7 +133,7 @@ def _batches(poses: Floats, rng: np.random.Generator) -> Iterator[tuple[Any, Any
             yield inputs[start : start + BATCH], wanted[start : start + BATCH]
 
 
-def _forward(w: dict[str, torch.Tensor], n_blocks: int, inputs: torch.Tensor) -> torch.Tensor:
+def forward(w: dict[str, torch.Tensor], n_blocks: int, inputs: torch.Tensor) -> torch.Tensor:
     """The same as ``Network.lift``, up to the hip midpoint."""
     import torch
 
@@ -158,7 +158,7 @@ def _write(
             stream,
             n_blocks=n_blocks,
             n_samples=n_samples,
-            library=library.manifest.sha256,
+            poses=library.manifest.files["poses.npy"].sha256,
             **{name: value.numpy() for name, value in weights.items()},
         )
     unfinished.replace(out)

@@ -52,14 +52,14 @@ class Network:
     """The trained network.
 
     ``weights``: ``w_in`` (43, W), ``b_in`` (W,), per block i ``w_<i>a``, ``b_<i>a``, ``w_<i>b``,
-    ``b_<i>b``, and ``w_out`` (W, 42), ``b_out``; ``n_samples`` seen in training; ``library`` it was
-    trained on, by the digest of its content.
+    ``b_<i>b``, and ``w_out`` (W, 42), ``b_out``; ``n_samples`` seen in training; ``poses``, the
+    SHA-256 of the ``poses.npy`` it was trained on.
     """
 
     weights: Mapping[str, Floats]
     n_blocks: int
     n_samples: int
-    library: str
+    poses: str
 
     @staticmethod
     def load(path: Path) -> Network:
@@ -67,7 +67,7 @@ class Network:
         with np.load(path, allow_pickle=False) as data:
             weights = {k: data[k].astype(np.float64) for k in data.files if k[:2] in ("w_", "b_")}
             return Network(
-                weights, int(data["n_blocks"]), int(data["n_samples"]), str(data["library"])
+                weights, int(data["n_blocks"]), int(data["n_samples"]), str(data["poses"])
             )
 
     @property

@@ -11,7 +11,6 @@ import numpy as np
 
 from app.drawing.picture import Picture
 from app.drawing.svg import to_svg
-from app.lifting.types import Intrinsics
 from evaluation.metrics import rigid_error_mm, root_centred_error_mm
 from evaluation.paper import figures, published, report, study
 from evaluation.paper.chart import chart
@@ -30,9 +29,8 @@ from evaluation.paper.network import Network
 from evaluation.paper.study import TestSet
 from evaluation.paper.systems import Seen2D, System, default_method, learned, paper_method
 from evaluation.paper.videos import find_videos, look_at_videos
-from evaluation.paper.views import Scene, SceneCamera, Views, draw, look, some
+from evaluation.paper.views import Scene, Views, draw, look, of_lifting_set, some
 from evaluation.protocols import load_lifting_set
-from library_store.importers.clip import Clip
 from library_store.library import Library, load
 
 P1_SECONDS, P2_SECONDS = 64 / 50, 0.1
@@ -344,16 +342,8 @@ def _with_videos(
 
 
 def _lifting_views(path: Path, options: Options) -> TestSet:
-    """A lifting set (``evaluation.protocols``) as views of one camera, all of one action."""
-    data = load_lifting_set(path)
-    upright = np.diag([1.0, -1.0, -1.0])
-    n = len(data.joints_3d_mm)
-    clip = Clip(
-        path.stem, "", "", 1.0, (data.joints_3d_mm @ upright).astype(np.float32), np.arange(n)
-    )
-    pinhole: Intrinsics = data.intrinsics
-    scene = Scene(clip, "all", (SceneCamera("", upright, np.zeros(3), pinhole),))
-    views = some(look([scene]), options.views, options.rng())
+    """A lifting set (``evaluation.protocols``), or some of it."""
+    views = some(of_lifting_set(load_lifting_set(path)), options.views, options.rng())
     return TestSet(views, {"gt": Seen2D(views.points_px())}, ("all",))
 
 

@@ -31,12 +31,20 @@ class Seen2D:
     """2D of N views.
 
     ``points_px`` (N, 14, 2); from a network also its own ``confidence`` (N, 14) and
-    ``covariance_px2`` (N, 14, 2, 2), which the paper's method does not look at.
+    ``covariance_px2`` (N, 14, 2, 2), which the paper's method does not look at; ``present``
+    (N, 14), all by default.
     """
 
     points_px: Floats
     confidence: Floats | None = None
     covariance_px2: Floats | None = None
+    present: Mask | None = None
+
+    @property
+    def there(self) -> Mask:
+        """(N, 14) which joints there are."""
+        shape = self.points_px.shape[:2]
+        return np.ones(shape, dtype=bool) if self.present is None else self.present
 
     def of(self, rows: Integers) -> Seen2D:
         """That of some of the views."""
@@ -45,14 +53,16 @@ class Seen2D:
             self.points_px[rows],
             None if confidence is None else confidence[rows],
             None if covariance is None else covariance[rows],
+            self.there[rows],
         )
 
     def observation(self, row: int, *, plain: bool) -> Observation:
         """One person; ``plain``: all joints alike."""
         points = self.points_px[row]
         if plain or self.confidence is None or self.covariance_px2 is None:
-            return Observation(points, np.ones(len(points)))
-        return Observation(points, self.confidence[row], self.covariance_px2[row])
+            return Observation(points, self.there[row].astype(np.float64))
+        confidence = np.where(self.there[row], self.confidence[row], 0.0)
+        return Observation(points, confidence, self.covariance_px2[row])
 
 
 @dataclass(frozen=True)
@@ -90,10 +100,9 @@ def learned(network: Network, *, warped: bool) -> Lift:
     def lift(views: Views, seen: Seen2D) -> Answers:
         turned = _centred(views, seen)
         points = np.stack([view.points for view in turned])
-        present: Mask = np.ones(points.shape[:2], dtype=bool)
-        poses = network.lift(points, present)
+        poses = network.lift(points, seen.there)
         if warped:
-            poses = warp_onto(poses, points, present)
+            poses = warp_onto(poses, points, seen.there)
         return Answers(_back(turned, poses))
 
     return lift
@@ -104,10 +113,8 @@ def known_depths(views: Views, seen: Seen2D, placed_mm: Floats | None = None) ->
     turned = _centred(views, seen)
     placed = views.joints_mm if placed_mm is None else placed_mm
     warped = [
-        warp_weak_perspective(
-            joints @ view.rotation.T, view.points, np.ones(len(joints), dtype=bool)
-        )
-        for joints, view in zip(placed, turned, strict=True)
+        warp_weak_perspective(joints @ view.rotation.T, view.points, present)
+        for joints, view, present in zip(placed, turned, seen.there, strict=True)
     ]
     return _back(turned, np.stack(warped))
 
@@ -180,7 +187,7 @@ def _centred(views: Views, seen: Seen2D) -> list[CentredView]:
         turned.append(
             centre_view(
                 seen.points_px[row],
-                np.ones(views.joints_mm.shape[1]),
+                seen.there[row].astype(np.float64),
                 None,
                 pinhole.focal_length_px,
                 np.array(pinhole.principal_point_px),

@@ -14,6 +14,7 @@ import numpy as np
 from app.lifting.geometry import Floats, Integers, project
 from app.lifting.types import Intrinsics
 from evaluation.metrics import root
+from evaluation.protocols import LiftingSet
 from library_store.cameras import rotations
 from library_store.importers.clip import Clip
 
@@ -167,6 +168,17 @@ def virtual_cameras(rng: np.random.Generator) -> tuple[SceneCamera, ...]:
         SceneCamera(f"virtual-{k}", rotation, None, pinhole)
         for k, rotation in enumerate(rotations(np.array(rows)))
     )
+
+
+def of_lifting_set(data: LiftingSet) -> Views:
+    """The people of a lifting set as views of its one camera, all of one action."""
+    upright = np.diag([1.0, -1.0, -1.0])
+    n = len(data.joints_3d_mm)
+    world = (data.joints_3d_mm @ upright).astype(np.float32)
+    clip = Clip(data.name, "", "", 1.0, world, np.arange(n))
+    scene = Scene(clip, "all", (SceneCamera("", upright, np.zeros(3), data.intrinsics),))
+    zeros = np.zeros(n, dtype=np.int64)
+    return Views((scene,), data.joints_3d_mm, zeros, zeros, np.arange(n))
 
 
 def _gather(scenes: tuple[Scene, ...], parts: Sequence[tuple[int, int, Integers]]) -> Views:

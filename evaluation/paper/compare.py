@@ -1,0 +1,72 @@
+"""The paper's method, the default one and the MLP on the same people, library and noise.
+
+    python -m evaluation.paper.compare --library DIR --mlp mlp.npz --data set.npz
+
+``--data`` is a lifting set (``evaluation.protocols``), repeatable; the MLP should have been trained
+on the library's own poses, which are checked to be the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from evaluation.metrics import summarise
+from evaluation.paper.network import Network
+from evaluation.paper.systems import Seen2D, System, default_method, learned, paper_method
+from evaluation.paper.views import Views, of_lifting_set
+from evaluation.protocols import load_lifting_set, one_missing
+from library_store.library import load
+
+
+def rows(views: Views, seen: Seen2D, noise: str, systems: Sequence[System]) -> list[str]:
+    """A line of the table for each method."""
+    lines = []
+    for system in systems:
+        found = summarise(system.lift(views, seen).answer_mm, views.joints_mm)
+        lines.append(
+            f"| {noise} | {system.label} | {found.p1_mean:.1f} / {found.p1_median:.1f} "
+            f"| {found.p2_mean:.1f} / {found.p2_median:.1f} "
+            f"| {found.pa_mean:.1f} / {found.pa_median:.1f} |"
+        )
+    return lines
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Command line: see the module."""
+    parser = argparse.ArgumentParser(prog="evaluation.paper.compare", description=__doc__)
+    parser.add_argument("--library", type=Path, required=True)
+    parser.add_argument("--mlp", type=Path, required=True)
+    parser.add_argument("--data", type=Path, action="append", required=True)
+    parser.add_argument("--people", type=int, default=None, help="only the first N of each set")
+    chosen = parser.parse_args(arguments)
+    library, network = load(chosen.library), Network.load(chosen.mlp)
+    systems = [
+        System("paper", paper_method(library)),
+        System("default", default_method(library)),
+        System("MLP", learned(network, warped=False)),
+        System("MLP, warped", learned(network, warped=True)),
+    ]
+    if network.poses != library.manifest.files["poses.npy"].sha256:
+        print("The MLP was trained on other poses than the library's.")
+    print(
+        f"Library {library.manifest.name}, {len(library):,} exemplars; MLP of width "
+        f"{network.width}, {network.n_samples:,} samples. Errors in mm, mean / median."
+    )
+    for path in chosen.data:
+        data = load_lifting_set(path).first(chosen.people)
+        views = of_lifting_set(data)
+        print(f"\n## {data.name}: {len(views)} people\n\n| 2D | method | P1 | P2 | PA |")
+        print("|---|---|---|---|---|")
+        for noise, points in data.joints_2d_px.items():
+            print(*rows(views, Seen2D(points), f"{noise} px", systems), sep="\n", flush=True)
+        spoilt = one_missing(data.joints_2d_px[min(data.joints_2d_px)])
+        missing = Seen2D(spoilt.points_px, present=np.asarray(spoilt.confidence > 0))
+        print(*rows(views, missing, "a limb joint missing", systems), sep="\n", flush=True)
+
+
+if __name__ == "__main__":
+    main()
