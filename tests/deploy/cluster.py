@@ -63,7 +63,12 @@ class Cluster:
         ]
         with self._log.open("w") as log:
             self._process = subprocess.Popen(
-                command, cwd=ROOT, env=self._environment, stdout=log, stderr=log
+                command,
+                cwd=ROOT,
+                env=self._environment,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,  # which tells this cluster's processes from all others
             )
         try:
             wait_until(self._has_started, "ray start")
@@ -106,7 +111,7 @@ class Cluster:
 
     def replicas(self) -> set[int]:
         """The process ids of the replicas that run or are being started."""
-        return {pid for pid in self._members() if _read(pid, "cmdline").startswith(REPLICA)}
+        return {pid for pid in self._members() if _command(pid).startswith(REPLICA)}
 
     def answering(self, asked: int = 12) -> dict[str, int]:
         """Which replicas answer /metrics: when each started -> how many photos it has answered."""
@@ -143,13 +148,19 @@ class Cluster:
         shutil.rmtree(self._directory, ignore_errors=True)
 
     def _members(self) -> set[int]:
-        mark = b"RAY_TMPDIR=" + os.fsencode(self._directory)
         pids = (int(path.name) for path in Path("/proc").glob("[0-9]*"))
-        return {pid for pid in pids if mark in _read(pid, "environ").split(b"\0")}
+        return {pid for pid in pids if _session(pid) == self._process.pid}
 
 
-def _read(pid: int, name: str) -> bytes:
+def _session(pid: int) -> int | None:
     try:
-        return Path(f"/proc/{pid}/{name}").read_bytes()
+        return os.getsid(pid)
+    except ProcessLookupError:
+        return None
+
+
+def _command(pid: int) -> bytes:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
         return b""  # it has ended
