@@ -66,11 +66,14 @@ def test_a_build_killed_beside_a_running_service(
 
 @pytest.mark.parametrize("keep", [0.0, 0.5])
 def test_a_truncated_index_refuses_to_start(tmp_path: Path, library_dir: Path, keep: float) -> None:
-    broken = tmp_path / "broken"
-    shutil.copytree(library_dir, broken)
-    (index,) = broken.glob("index*")
-    index.write_bytes(index.read_bytes()[: int(keep * index.stat().st_size)])
-    assert index.name in refusal(tmp_path, library_dir=broken)
+    files = sorted(path.name for path in library_dir.glob("index*"))
+    assert files
+    for name in files:
+        broken = tmp_path / name / "broken"
+        shutil.copytree(library_dir, broken)
+        index = broken / name
+        index.write_bytes(index.read_bytes()[: int(keep * index.stat().st_size)])
+        assert name in refusal(tmp_path, library_dir=broken)
 
 
 def test_a_full_disk_fails_the_build_and_leaves_nothing(tmp_path: Path, library_dir: Path) -> None:
