@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Maps = NDArray[np.float32]
+RESIDUE = 0.05
+"""Beliefs below this share of the strongest are none."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,17 @@ def marginals(maps: NDArray[np.float32], kind: str) -> Maps:
         flat = np.maximum(flat, np.float32(1e-12))
     p: Maps = (flat / flat.sum(-1, keepdims=True)).reshape(maps.shape)
     return p
+
+
+def without_residue(p: Maps) -> Maps:
+    """Marginals (N, J, h, w) less what is everywhere, summing to 1 again.
+
+    A regression of beliefs leaves a hundredth or so in every cell: over the whole map more than the
+    peak holds, it would make each joint's spread as wide as the crop.
+    """
+    kept = np.where(p < RESIDUE * p.max((-1, -2), keepdims=True), np.float32(0), p)
+    rest: Maps = kept / kept.sum((-1, -2), keepdims=True)
+    return rest
 
 
 def sub_cell_peaks(p: Maps) -> tuple[Floats, NDArray[np.int64]]:
@@ -159,6 +172,8 @@ def read_maps(
         background = 1 / (1 + np.exp(-np.clip(background, -30, 30)))
     p = marginals(joint_maps, kind)
     at, best = sub_cell_peaks(p)
+    if kind == "beliefs":
+        p = without_residue(p)
     covariance = spread(p, at, target_sigma_cells)
     peak = peak_beliefs(joint_maps, best, kind)
     return Reading(at, covariance, peak, confidence_features(peak, covariance, p, best, background))

@@ -3,7 +3,15 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from models.heatmaps import calibrated, marginals, peak_beliefs, spread, sub_cell_peaks
+from models.heatmaps import (
+    calibrated,
+    marginals,
+    peak_beliefs,
+    read_maps,
+    spread,
+    sub_cell_peaks,
+    without_residue,
+)
 
 CELLS = 40
 STRIDE = 4.0
@@ -41,6 +49,17 @@ def test_beliefs_and_logits_give_the_same_place() -> None:
         marginals(np.exp(log_map)[None, None].astype(np.float32), "beliefs")
     )
     np.testing.assert_allclose(logits, beliefs, atol=0.01)
+
+
+def test_what_a_regression_leaves_everywhere_is_no_spread() -> None:
+    belief = 0.7 * np.exp(gaussian(17.3, 22.6, 2.0, 2.0))
+    noise = np.random.default_rng(0).uniform(0, 0.02, belief.shape)
+    maps = np.stack([belief + noise, 1 - belief])[None].astype(np.float32)
+    read = read_maps(maps, 1, "beliefs", target_sigma_cells=1.0)
+    np.testing.assert_allclose(read.at[0, 0], (17.3, 22.6), atol=0.2)
+    # 2² less the blur of the targets; all that lies below the residue's level is lost.
+    np.testing.assert_allclose(read.covariance[0, 0], 3 * np.eye(2), atol=1.0)
+    np.testing.assert_allclose(without_residue(maps).sum((-1, -2)), 1, rtol=1e-6)
 
 
 def test_marginals_sum_to_one_even_for_extreme_maps() -> None:
