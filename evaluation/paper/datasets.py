@@ -99,7 +99,7 @@ def find_h36m(root: Path) -> Found:
             continue
         try:
             cameras = virtual_cameras(rng) if metadata is None else h36m_cameras(metadata, clip)
-        except MocapError as error:
+        except (MocapError, ValueError) as error:
             found.missing.append(f"{clip.name}: {error}")
             continue
         found.scenes.append(Scene(clip, column, cameras))

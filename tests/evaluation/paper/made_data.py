@@ -77,22 +77,24 @@ def _fifteen(joints: Floats) -> Floats:
     return out
 
 
-def camera_angles(index: int) -> tuple[float, float, float]:
-    """Angles a, b, c (radians) of a level camera that looks along a compass direction."""
-    return np.pi / 2, 0.0, index * np.pi / 2
+def made_camera(index: int) -> tuple[Floats, Floats]:
+    """R (3, 3) and place (3,) mm, Z up, of a level camera that looks along a compass direction."""
+    rotation = _rotation(*_angles(index))
+    return rotation, np.array([0.0, 0.0, 1000.0]) - DISTANCE_MM * rotation[2]
 
 
 def metadata_xml(path: Path) -> None:
     """``metadata.xml``: four cameras on a circle around the origin, the same for all subjects."""
     numbers: list[float] = []
     for index in range(len(CAMERAS)):
-        a, b, c = camera_angles(index)
-        forward = _rotation(a, b, c)[2]
-        place = np.array([0.0, 0.0, 1000.0]) - DISTANCE_MM * forward
-        numbers += [a, b, c, *place.tolist()] * N_SUBJECTS
+        numbers += [*_angles(index), *made_camera(index)[1].tolist()] * N_SUBJECTS
     for _ in CAMERAS:
         numbers += [FOCAL_PX, FOCAL_PX, *CENTRE_PX, 0, 0, 0, 0, 0]
     path.write_text(f"<metadata><w0>[{' '.join(f'{n:.9g}' for n in numbers)}]</w0></metadata>")
+
+
+def _angles(index: int) -> tuple[float, float, float]:
+    return np.pi / 2, 0.0, index * np.pi / 2
 
 
 def _rotation(a: float, b: float, c: float) -> Floats:

@@ -23,9 +23,11 @@ from tests.evaluation.paper.made_data import (
     acting,
     h36m_npz,
     humaneva_npz,
+    made_camera,
     metadata_xml,
     video,
 )
+from tests.library_store.importers.test_h36m import write_cdf
 
 SMALL = ("--entries", "1500", "--views", "24", "--curve-views", "8")
 ACTED = ("Directions 1", "Walking", "_ALL")
@@ -108,6 +110,29 @@ def test_real_cameras_see_the_person_where_they_stand(users_folder: Path) -> Non
     assert ((points > 0) & (points < 1000)).all()
     humaneva = find_humaneva(users_folder)
     assert {scene.clip.subject for scene in humaneva.scenes} == {"Validate/S1", "Validate/S2"}
+
+
+def test_the_authors_own_files(tmp_path: Path) -> None:
+    """World and camera-frame CDF files of one clip give the same views by the same camera."""
+    world = acting(20, 5)
+    for name in ("world", "camera"):
+        metadata = tmp_path / name / "code" / "metadata.xml"
+        metadata.parent.mkdir(parents=True)
+        metadata_xml(metadata)
+        # The importer looks for it in the folders above its files.
+        metadata_xml(tmp_path / name / "metadata.xml")
+    write_cdf(tmp_path / "world/S9/MyPoseFeatures/D3_Positions/Eating 2.cdf", world)
+    rotation, place = made_camera(1)
+    mono = (world - place) @ rotation.T
+    write_cdf(tmp_path / "camera/S9/Poses_D3_Positions_mono/Eating 2.55011271.cdf", mono)
+    of_world, of_camera = (find_h36m(tmp_path / name) for name in ("world", "camera"))
+    assert [camera.name for camera in of_camera.scenes[0].cameras] == ["55011271"]
+    seen, expected = look(of_camera.scenes), look(of_world.scenes)
+    expected = expected[np.flatnonzero(expected.camera == 1)]
+    assert set(seen.actions) == {"Eat"}
+    np.testing.assert_allclose(seen.joints_mm, expected.joints_mm, atol=0.01)
+    np.testing.assert_allclose(seen.joints_mm, mono[:, H36M_32], atol=0.01)
+    assert "Human3.6M subject S11" in of_world.missing
 
 
 def test_a_library_of_views_knows_them(users_folder: Path, tmp_path: Path) -> None:
