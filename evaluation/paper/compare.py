@@ -41,7 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--library", type=Path, required=True)
     parser.add_argument("--mlp", type=Path, required=True)
     parser.add_argument("--data", type=Path, action="append", required=True)
-    parser.add_argument("--people", type=int, default=None, help="only the first N of each set")
+    parser.add_argument("--people", type=int, default=None, help="only N, spread over each set")
+    parser.add_argument("--only", action="append", help="a method; repeatable; default all")
     chosen = parser.parse_args(arguments)
     library, network = load(chosen.library), Network.load(chosen.mlp)
     systems = [
@@ -50,6 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         System("MLP", learned(network, warped=False)),
         System("MLP, warped", learned(network, warped=True)),
     ]
+    systems = [s for s in systems if chosen.only is None or s.label in chosen.only]
     if network.poses != library.manifest.files["poses.npy"].sha256:
         print("The MLP was trained on other poses than the library's.")
     print(
@@ -57,13 +59,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         f"{network.width}, {network.n_samples:,} samples. Errors in mm, mean / median."
     )
     for path in chosen.data:
-        data = load_lifting_set(path).first(chosen.people)
-        views = of_lifting_set(data)
+        data = load_lifting_set(path)
+        everybody = of_lifting_set(data)
+        n = len(everybody)
+        people = np.linspace(0, n - 1, min(chosen.people or n, n)).round().astype(np.int64)
+        views = everybody[people]
         print(f"\n## {data.name}: {len(views)} people\n\n| 2D | method | P1 | P2 | PA |")
         print("|---|---|---|---|---|")
         for noise, points in data.joints_2d_px.items():
-            print(*rows(views, Seen2D(points), f"{noise} px", systems), sep="\n", flush=True)
-        spoilt = one_missing(data.joints_2d_px[min(data.joints_2d_px)])
+            seen = Seen2D(points[people])
+            print(*rows(views, seen, f"{noise} px", systems), sep="\n", flush=True)
+        spoilt = one_missing(data.joints_2d_px[min(data.joints_2d_px)][people])
         missing = Seen2D(spoilt.points_px, present=np.asarray(spoilt.confidence > 0))
         print(*rows(views, missing, "a limb joint missing", systems), sep="\n", flush=True)
 

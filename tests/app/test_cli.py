@@ -134,11 +134,12 @@ def test_evaluate_lists_and_runs_programs() -> None:
     listed = invoke("evaluate")
     assert listed.exit_code == 0
     names = {line.split()[0] for line in listed.stdout.splitlines()}
-    assert {"lifting", "pose2d", "renders"} <= names
+    assert {"lifting", "paper", "pose2d", "renders"} <= names
     assert "metrics" not in names, "no program"
-    helped = run("evaluate", "renders", "--help")
-    assert helped.returncode == 0
-    assert "posematch evaluate renders" in helped.stdout
+    for program in ("renders", "paper"):
+        helped = run("evaluate", program, "--help")
+        assert helped.returncode == 0
+        assert f"posematch evaluate {program}" in helped.stdout
     unknown = invoke("evaluate", "luck")
     assert unknown.exit_code == 2
     assert "lifting" in unknown.stderr
