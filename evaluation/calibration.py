@@ -24,56 +24,72 @@ from evaluation.lifting import Lifted, lift_all
 from evaluation.metrics import Floats, rigid_error_mm, root_centred_error_mm
 from evaluation.protocols import LiftingSet, clean, load_lifting_set
 from library_store.library import Library, load
+from library_store.skeleton import LSP14
 
 COVERAGE = 0.68
 LIBRARY_SIGMAS_PX = (10.0, 15.0, 20.0, 30.0, 40.0, 55.0, 80.0)
 STATED_FLOOR_PX = 0.5
 PROBABILITY_EDGES = (0.0, 0.02, 0.04, 0.06, 0.08, 0.12, 1.0)
-FLOORS_MM = (0.0, 5.0, 10.0, 20.0, 30.0, 45.0, 60.0, 90.0)
+NOISE_MM_PER_PX = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0, 30.0)
+LEVEL_TOLERANCE = 0.04
+"""How far the coverage of one noise level may be off, on the people fitted on."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Posterior spread and root-relative error, each (N, 14) mm."""
+    """Posterior spread and root-relative error, each (N, 14) mm; noise found, (N,) standard px."""
 
     spread_mm: Floats
     error_mm: Floats
+    noise_px: Floats
 
     def split(self) -> tuple[Errors, Errors]:
         """Even-numbered and odd-numbered people."""
         return (
-            Errors(self.spread_mm[::2], self.error_mm[::2]),
-            Errors(self.spread_mm[1::2], self.error_mm[1::2]),
+            Errors(self.spread_mm[::2], self.error_mm[::2], self.noise_px[::2]),
+            Errors(self.spread_mm[1::2], self.error_mm[1::2], self.noise_px[1::2]),
         )
 
 
-def fit_sigma(errors: Errors) -> SigmaCalibration:
-    """Factors that give each joint 68% coverage, and the floor that does so most sharply.
+def fit_sigma(levels: Sequence[Errors]) -> SigmaCalibration:
+    """Factors that give each joint 68% coverage over all noise levels together.
 
-    Sharpness is the pinball loss of the 68% quantile, the proper score for that radius.
+    Of the values for the noise the sharpest that covers every level about equally well, else the
+    one that covers them most equally. Sharpness is the pinball loss of the 68% quantile, the proper
+    score for that radius.
     """
-    best: tuple[float, SigmaCalibration] | None = None
-    for floor in FLOORS_MM:
-        ratio = errors.error_mm / np.sqrt(errors.spread_mm**2 + floor**2)
+    everybody = pooled(levels)
+    best: tuple[tuple[float, float], SigmaCalibration] | None = None
+    for noise in NOISE_MM_PER_PX:
+        plain = SigmaCalibration((1.0,) * everybody.error_mm.shape[1], noise)
+        ratio = everybody.error_mm / plain(everybody.spread_mm, everybody.noise_px)
         factors = np.quantile(ratio, COVERAGE, axis=0)
-        candidate = SigmaCalibration(tuple(round(float(f), 3) for f in factors), floor)
-        excess = errors.error_mm - candidate(errors.spread_mm)
+        candidate = SigmaCalibration(tuple(round(float(f), 3) for f in factors), noise)
+        excess = everybody.error_mm - candidate(everybody.spread_mm, everybody.noise_px)
         loss = float(np.maximum(COVERAGE * excess, (COVERAGE - 1.0) * excess).mean())
-        if best is None or loss < best[0]:
-            best = loss, candidate
+        uneven = max(abs(coverage(candidate, level) - COVERAGE) for level in levels)
+        score = (max(uneven, LEVEL_TOLERANCE), loss)
+        if best is None or score < best[0]:
+            best = score, candidate
     assert best is not None
     return best[1]
 
 
+def coverage(calibration: SigmaCalibration, errors: Errors) -> float:
+    """Share of errors within the radius."""
+    return float((errors.error_mm <= calibration(errors.spread_mm, errors.noise_px)).mean())
+
+
 def collect_errors(library: Library, data: LiftingSet, settings: LiftingSettings) -> list[Errors]:
     """Spread and error of the fused answer at every noise level."""
-    raw = replace(settings, sigma=SigmaCalibration((1.0,) * 14, 0.0))
+    raw = replace(settings, sigma=SigmaCalibration((1.0,) * LSP14.n_joints, 0.0))
     collected = []
     for points in data.joints_2d_px.values():
         lifted = lift_all(Lifter(library, raw), clean(points), data.intrinsics, "fusion")
         assert lifted.sigma_mm is not None
         error = root_centred_error_mm(lifted.joints_mm, data.joints_3d_mm)
-        collected.append(Errors(lifted.sigma_mm, error))
+        noise = [person.noise_px for person in lifted.people if person.noise_px is not None]
+        collected.append(Errors(lifted.sigma_mm, error, np.array(noise)))
     return collected
 
 
@@ -130,16 +146,17 @@ def pooled(parts: Sequence[Errors]) -> Errors:
     return Errors(
         np.concatenate([part.spread_mm for part in parts]),
         np.concatenate([part.error_mm for part in parts]),
+        np.concatenate([part.noise_px for part in parts]),
     )
 
 
 def report_coverage(label: str, calibration: SigmaCalibration, parts: Sequence[Errors]) -> None:
     """Print coverage by noise level, and the rank correlation of sigma with error by person."""
     for level, part in enumerate(parts):
-        sigma = calibration(part.spread_mm)
+        sigma = calibration(part.spread_mm, part.noise_px)
         ranks = np.array([np.argsort(np.argsort(v.mean(1))) for v in (sigma, part.error_mm)])
         print(
-            f"{label}, noise level {level}: covers {(part.error_mm <= sigma).mean():.1%}, "
+            f"{label}, noise level {level}: covers {coverage(calibration, part):.1%}, "
             f"sigma {sigma.mean():.0f} mm, Spearman {np.corrcoef(ranks)[0, 1]:.2f}"
         )
 
@@ -165,7 +182,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     data = load_lifting_set(chosen.data).first(chosen.people)
 
     halves = [errors.split() for errors in collect_errors(library, data, settings)]
-    calibration = fit_sigma(pooled([half[0] for half in halves]))
+    calibration = fit_sigma([half[0] for half in halves])
     print(calibration)
     report_coverage("fitted half", calibration, [half[0] for half in halves])
     report_coverage("other half", calibration, [half[1] for half in halves])

@@ -189,10 +189,11 @@ class Lifter:
         present = confidence > 0
         if method == "paper":
             warped = answer = warp_weak_perspective(best, view.points, present)
-            sigma = None
+            sigma = noise_px = None
         else:
             warped, answer = warp_perspective(best, view.points, present), fused.joints_mm
-            sigma = settings.sigma(fused.spread_mm) if settings.sigma is not None else None
+            noise_px = fused.noise_px
+            sigma = settings.sigma(fused.spread_mm, noise_px) if settings.sigma else None
         answer, warped = view.to_photo(answer), view.to_photo(warped)
         scale_source: ScaleSource = "library"
         if subject_height_mm is not None:
@@ -211,6 +212,7 @@ class Lifter:
             candidates=candidates[:n_candidates],
             joints_3d_mm=answer,
             sigma_mm=sigma,
+            noise_px=noise_px,
             root_mm=0.5 * (answer[R_HIP] + answer[L_HIP]),
             scale_source=scale_source,
             warnings=tuple(warnings),

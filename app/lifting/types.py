@@ -87,8 +87,9 @@ class LiftedPerson:
 
     ``exemplar`` is candidate 0 and ``warped_mm`` (14, 3) its warp by eq. 6; ``candidates`` are the
     most probable first; ``joints_3d_mm`` (14, 3) the method's answer; ``sigma_mm`` (14,) the radius
-    that holds 68% of root-relative errors, or None where it is not calibrated; ``root_mm`` (3,) the
-    hip midpoint of the answer.
+    that holds 68% of root-relative errors, or None where it is not calibrated; ``noise_px`` the
+    noise found in the 2D joints beyond what was stated of them, standard pixels, None for the
+    paper's method; ``root_mm`` (3,) the hip midpoint of the answer.
     """
 
     exemplar: Hypothesis
@@ -96,6 +97,7 @@ class LiftedPerson:
     candidates: tuple[Hypothesis, ...]
     joints_3d_mm: Floats
     sigma_mm: Floats | None
+    noise_px: float | None
     root_mm: Floats
     scale_source: ScaleSource
     warnings: tuple[str, ...] = field(default=())

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evaluation import calibration, lifting
-from evaluation.calibration import Errors, fit_sigma
+from evaluation.calibration import Errors, coverage, fit_sigma
 from evaluation.protocols import load_lifting_set, one_corrupted, one_missing
 from library_store.build import BuildSettings, build_library
 from library_store.prior import PosePrior
@@ -77,9 +77,14 @@ def test_spoiling_touches_one_joint(data: Path) -> None:
 
 def test_sigma_fit_recovers_what_made_the_errors() -> None:
     rng = np.random.default_rng(0)
-    spread = rng.uniform(20, 120, size=(6_000, 14))
-    error = np.abs(rng.normal(size=spread.shape)) * np.sqrt(spread**2 + 30.0**2)
-    fitted = fit_sigma(Errors(spread, error))
-    np.testing.assert_allclose(fitted.factors, 0.994, atol=0.06)
-    assert fitted.floor_mm == pytest.approx(30.0, abs=15.0)
-    assert (error <= fitted(spread)).mean() == pytest.approx(0.68, abs=0.005)
+    levels = []
+    for noise in (1.0, 5.0, 10.0):
+        spread = rng.uniform(20, 120, size=(3_000, 14))
+        noise_px = noise * rng.uniform(0.7, 1.3, size=3_000)
+        sd = np.sqrt(spread**2 + (8.0 * noise_px[:, None]) ** 2)
+        levels.append(Errors(spread, np.abs(rng.normal(size=spread.shape)) * sd, noise_px))
+    fitted = fit_sigma(levels)
+    np.testing.assert_allclose(fitted.factors, 0.994, atol=0.08)
+    assert fitted.noise_mm_per_px == pytest.approx(8.0, abs=3.0)
+    for level in levels:
+        assert coverage(fitted, level) == pytest.approx(0.68, abs=0.03)
