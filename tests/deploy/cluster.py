@@ -26,6 +26,8 @@ REPLICA = b"ray::ServeReplica:posematch:posematch"
 PATIENCE_S = 100.0
 # An address of this machine that Ray does not take for a laptop's own.
 _NODE = "127.0.0.2"
+# Ray gives its own processes 30 s to start, which a busy machine may exceed.
+_STARTS = 3
 
 
 def wait_until(done: Callable[[], bool], what: str) -> None:
@@ -47,13 +49,21 @@ class Cluster:
         self.url = f"http://127.0.0.1:{self.port}"
 
     def __enter__(self) -> Self:
+        for tried in range(1, _STARTS + 1):
+            try:
+                self._start()
+                break
+            except AssertionError:
+                self._end()
+                if tried == _STARTS:
+                    raise
+        return self
+
+    def _start(self) -> None:
         # Not pytest's: the paths of Ray's sockets have to be short.
         self._directory = Path(tempfile.mkdtemp(prefix="ray-"))
-        inherited = {
-            k: v for k, v in os.environ.items() if not k.startswith(("POSEMATCH_", "RAY_"))
-        }
-        # Marks every process of this cluster, so that those of another are left alone.
-        self._environment = {**inherited, "RAY_TMPDIR": str(self._directory)}
+        outside = ("POSEMATCH_", "RAY_")
+        self._environment = {k: v for k, v in os.environ.items() if not k.startswith(outside)}
         command = [
             *(str(self._bin / "ray"), "start", "--head", "--block", "--num-cpus=2"),
             *("--include-dashboard=false", "--disable-usage-stats"),
@@ -70,12 +80,7 @@ class Cluster:
                 stderr=log,
                 start_new_session=True,  # which tells this cluster's processes from all others
             )
-        try:
-            wait_until(self._has_started, "ray start")
-        except BaseException:
-            self._end()
-            raise
-        return self
+        wait_until(self._has_started, "ray start")
 
     def _has_started(self) -> bool:
         log = self._log.read_text()

@@ -1,0 +1,66 @@
+"""The table of dependencies in docs/licences.md, made from the lock file and what is installed."""
+
+from __future__ import annotations
+
+import re
+import sys
+from importlib import metadata
+from pathlib import Path
+
+START, END = "<!-- dependencies: scripts/licences-table -->", "<!-- end of dependencies -->"
+LOCK = Path(__file__).resolve().parent.parent / "requirements.lock"
+_SPDX = {
+    "License :: OSI Approved :: Apache Software License": "Apache-2.0",
+    "License :: OSI Approved :: ISC License (ISCL)": "ISC",
+    "License :: OSI Approved :: MIT License": "MIT",
+    "3-Clause BSD License": "BSD-3-Clause",
+    "BSD-3-Clause": "BSD-3-Clause",
+}
+"""What packages without a licence expression say, in such expressions."""
+_ELSEWHERE = {"colorama": "BSD-3-Clause"}
+"""Packages that are installed on some other system."""
+
+
+def locked_packages() -> list[str]:
+    """Names in requirements.lock, in its order."""
+    names = re.findall(r"^([A-Za-z0-9][\w.-]*)==", LOCK.read_text(), re.MULTILINE)
+    return list(dict.fromkeys(names))
+
+
+def licence_of(package: str) -> str:
+    """SPDX expression of an installed package; ``KeyError`` when it says something unknown."""
+    if package in _ELSEWHERE:
+        return _ELSEWHERE[package]
+    said = metadata.metadata(package)
+    if "License-Expression" in said:
+        return str(said["License-Expression"])
+    classifiers = said.get_all("Classifier") or []
+    chosen = [line for line in classifiers if line.startswith("License ::")]
+    return " OR ".join(_SPDX[line] for line in chosen or [said["License"]])
+
+
+def licences_table() -> str:
+    """Markdown: package, licence."""
+    rows = ["| package | licence |", "|---|---|"]
+    rows += [
+        f"| [{name}](https://pypi.org/project/{name}/) | {licence_of(name)} |"
+        for name in locked_packages()
+    ]
+    return "\n".join(rows)
+
+
+def renewed(text: str) -> str:
+    """``text`` of a page with the table between the two marks renewed."""
+    before, _, rest = text.partition(START)
+    _, _, after = rest.partition(END)
+    return f"{before}{START}\n{licences_table()}\n{END}{after}"
+
+
+def main() -> None:
+    """Renew the page named on the command line."""
+    page = Path(sys.argv[1])
+    page.write_text(renewed(page.read_text()))
+
+
+if __name__ == "__main__":
+    main()
