@@ -48,7 +48,7 @@ def test_it_learns_a_users_people_and_serves_by_card(start: Path, tmp_path: Path
         out=tmp_path / "out",
         name="ours",
         source="drawings",
-        settings=FinetuneSettings(steps=120, lr=3e-3, hold_out=0.25, threads=1),
+        settings=FinetuneSettings(steps=60, lr=4e-3, hold_out=0.25, threads=1),
     )
     assert result.n_trained + result.n_held_out <= len(crops)
     assert result.after > result.before + 0.15, "people of one kind are learned quickly"
