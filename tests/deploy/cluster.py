@@ -63,7 +63,9 @@ class Cluster:
         # Not pytest's: the paths of Ray's sockets have to be short.
         self._directory = Path(tempfile.mkdtemp(prefix="ray-"))
         outside = ("POSEMATCH_", "RAY_")
-        self._environment = {k: v for k, v in os.environ.items() if not k.startswith(outside)}
+        inherited = {k: v for k, v in os.environ.items() if not k.startswith(outside)}
+        # By default Ray's workers, replicas among them, stand back behind all other processes.
+        self._environment = {**inherited, "RAY_worker_niceness": "0"}
         command = [
             *(str(self._bin / "ray"), "start", "--head", "--block", "--num-cpus=2"),
             *("--include-dashboard=false", "--disable-usage-stats"),
