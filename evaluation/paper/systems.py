@@ -22,7 +22,7 @@ from evaluation.paper.network import Network, warp_onto
 from evaluation.paper.views import SceneCamera, Views
 from library_store.library import Library
 
-CANDIDATES = 300
+CANDIDATES = 1_000
 """Exemplars, nearest by their inter-joint distances, among which the optimal one is sought."""
 
 
