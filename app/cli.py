@@ -12,6 +12,7 @@ from app.commands.console import notices, output
 from app.errors import PoseMatchError, RequestError
 from app.version import VERSION
 from library_store.errors import LibraryError
+from models import ModelError
 
 cli = typer.Typer(
     help="Photo in, 3D human pose out. Settings are environment variables, POSEMATCH_*.",
@@ -42,7 +43,7 @@ def main() -> None:
     except RequestError as error:
         notices.print(f"[red]error:[/red] {error.detail}", highlight=False, soft_wrap=True)
         sys.exit(1)
-    except LibraryError as error:
+    except (LibraryError, ModelError) as error:
         notices.print(f"[red]error:[/red] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(1)
     except PoseMatchError as error:

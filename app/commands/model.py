@@ -13,7 +13,6 @@ from rich.table import Table
 
 from app.commands.console import output
 from app.engine import chosen_networks
-from app.errors import StartupError
 from app.settings import Settings, load_settings
 from models import ModelCard, ModelError, ProviderChoice
 from models.caffe import LICENCE, JointOrder
@@ -46,18 +45,15 @@ def print_card(
     The ones that would serve here are marked with a star.
     """
     settings = load_settings()
-    try:
-        if name is not None:
-            card = _card(settings, name)
-            if as_json:
-                output.print_json(card.model_dump_json())
-            else:
-                output.print(_card_table(card))
-            return
-        chosen = chosen_networks(settings)
-        cards = _all_cards(settings)
-    except ModelError as error:
-        raise StartupError(str(error)) from error
+    if name is not None:
+        card = _card(settings, name)
+        if as_json:
+            output.print_json(card.model_dump_json())
+        else:
+            output.print(_card_table(card))
+        return
+    chosen = chosen_networks(settings)
+    cards = _all_cards(settings)
     if as_json:
         output.print_json(json.dumps([card.model_dump(mode="json") for card in cards]))
         return
@@ -95,24 +91,21 @@ def check(
     table = Table()
     for heading in ("network", "runs on", "input", "CPU-ms an input", "as its card has it"):
         table.add_column(heading)
-    try:
-        for card in _all_cards(settings) if name is None else [_card(settings, name)]:
-            model = OnnxModel(settings.weights_dir, card.name, provider=wanted)
-            spent_ms = round(cpu_ms(model), 2)
-            stated = card.cost_ms.get(str(model.runtime))
-            table.add_row(
-                f"{escape(card.name)} {escape(card.version)}",
-                str(model.runtime),
-                f"{card.output.side_px} px",
-                f"{spent_ms:.2f}",
-                "-" if stated is None else f"{stated:.2f}",
-            )
-            if save:
-                costs = card.cost_ms | {str(model.runtime): spent_ms}
-                path = settings.weights_dir / f"{card.name}.json"
-                write_card(path, card.model_copy(update={"cost_ms": costs}))
-    except ModelError as error:
-        raise StartupError(str(error)) from error
+    for card in _all_cards(settings) if name is None else [_card(settings, name)]:
+        model = OnnxModel(settings.weights_dir, card.name, provider=wanted)
+        spent_ms = round(cpu_ms(model), 2)
+        stated = card.cost_ms.get(str(model.runtime))
+        table.add_row(
+            f"{escape(card.name)} {escape(card.version)}",
+            str(model.runtime),
+            f"{card.output.side_px} px",
+            f"{spent_ms:.2f}",
+            "-" if stated is None else f"{stated:.2f}",
+        )
+        if save:
+            costs = card.cost_ms | {str(model.runtime): spent_ms}
+            path = settings.weights_dir / f"{card.name}.json"
+            write_card(path, card.model_copy(update={"cost_ms": costs}))
     output.print(table)
 
 
@@ -136,14 +129,9 @@ def export(
     except ModuleNotFoundError as error:
         raise _needs_training(error) from error
     network: training.Kind = "cpm" if kind == "cpm" else "person"
-    try:
-        card = training.export(
-            checkpoint, out, network, version=version, name=name, size_px=input_px
-        )
-        OnnxModel(out, card.name)
-        _complete(out, load_settings().weights_dir)
-    except ModelError as error:
-        raise StartupError(str(error)) from error
+    card = training.export(checkpoint, out, network, version=version, name=name, size_px=input_px)
+    OnnxModel(out, card.name)
+    _complete(out, load_settings().weights_dir)
     output.print(f"{out / card.file}, {card.name}.json", highlight=False, markup=False)
 
 
@@ -195,32 +183,29 @@ def finetune(
         from models.training.users_h36m import read_human36m
     except ModuleNotFoundError as error:
         raise _needs_training(error) from error
-    try:
-        if coco is not None and images is not None:
-            crops, source = read_coco(coco, images), f"{coco.name} (the user's own labels)"
-        else:
-            assert human36m is not None
-            crops = read_human36m(human36m, tuple(subject or ()), frames_apart)
-            source = f"Human3.6M, {', '.join(subject or ['all subjects'])} (academic use only)"
-        result = training.finetune(
-            crops,
-            weights_dir=settings.weights_dir,
-            start=start,
-            out=out,
-            name=name,
-            source=source,
-            settings=training.FinetuneSettings(
-                steps=steps,
-                minutes=minutes,
-                lr=lr,
-                hold_out=hold_out,
-                seed=seed,
-                threads=threads,
-            ),
-        )
-        _complete(out, settings.weights_dir)
-    except ModelError as error:
-        raise StartupError(str(error)) from error
+    if coco is not None and images is not None:
+        crops, source = read_coco(coco, images), f"{coco.name} (the user's own labels)"
+    else:
+        assert human36m is not None
+        crops = read_human36m(human36m, tuple(subject or ()), frames_apart)
+        source = f"Human3.6M, {', '.join(subject or ['all subjects'])} (academic use only)"
+    result = training.finetune(
+        crops,
+        weights_dir=settings.weights_dir,
+        start=start,
+        out=out,
+        name=name,
+        source=source,
+        settings=training.FinetuneSettings(
+            steps=steps,
+            minutes=minutes,
+            lr=lr,
+            hold_out=hold_out,
+            seed=seed,
+            threads=threads,
+        ),
+    )
+    _complete(out, settings.weights_dir)
     table = Table(title=f"{result.n_trained} people trained on, {result.n_held_out} held out")
     for heading in ("PCK@0.2 of those held out", "%"):
         table.add_column(heading)
@@ -255,13 +240,10 @@ def import_caffe(
     POSEMATCH_WEIGHTS_DIR=original POSEMATCH_MODEL=cpm-original posematch serve
     """  # noqa: D301, E501
     settings = load_settings()
-    try:
-        card = import_network(
-            prototxt, caffemodel, out, name=name, joints=joints, licence=licence or LICENCE
-        )
-        _complete(out, settings.weights_dir)
-    except ModelError as error:
-        raise StartupError(str(error)) from error
+    card = import_network(
+        prototxt, caffemodel, out, name=name, joints=joints, licence=licence or LICENCE
+    )
+    _complete(out, settings.weights_dir)
     output.print(_card_table(card))
 
 
@@ -279,7 +261,7 @@ def _needs_training(error: ModuleNotFoundError) -> Exception:
     """What to tell whoever has not installed the extra; other errors stay what they are."""
     if (error.name or "").partition(".")[0] not in TRAINING_PACKAGES:
         return error
-    return StartupError(
+    return ModelError(
         f"training and export need {error.name}: install posematch with its extra, "
         "pip install 'posematch[train]'"
     )

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from app.cli import cli
-from app.errors import StartupError
+from models import ModelError
 from models.card import WEIGHTS_DIR, read_card
 from tests.models.caffe import caffe_files
 from tests.models.training import user_files
@@ -50,7 +50,7 @@ def test_one_card_says_what_it_learned_from_and_its_licence() -> None:
 
 def test_a_card_that_is_not_there_is_named_with_those_that_are() -> None:
     result = invoke("card", "cpm-huge")
-    assert isinstance(result.exception, StartupError)
+    assert isinstance(result.exception, ModelError)
     assert "there are: cpm" in str(result.exception)
 
 
@@ -65,7 +65,7 @@ def test_check_measures_and_may_write_the_cost_into_the_card(weights: Path) -> N
 def test_check_refuses_a_file_that_is_not_its_cards(weights: Path) -> None:
     (weights / "person.onnx").write_bytes(b"something else")
     result = invoke("check", "person")
-    assert isinstance(result.exception, StartupError)
+    assert isinstance(result.exception, ModelError)
     assert "sha256 differs" in str(result.exception)
 
 
@@ -97,7 +97,7 @@ def test_import_caffe_says_what_is_wrong_with_the_files(tmp_path: Path) -> None:
         "--out",
         tmp_path,
     )
-    assert isinstance(result.exception, StartupError)
+    assert isinstance(result.exception, ModelError)
     assert "pose.caffemodel is no caffemodel" in str(result.exception)
 
 
@@ -115,5 +115,5 @@ def test_without_the_extra_training_says_what_to_install(
         "export": [path, "--version", "1", "--out", tmp_path],
     }[command]
     result = invoke(command, *arguments)
-    assert isinstance(result.exception, StartupError), result.output
+    assert isinstance(result.exception, ModelError), result.output
     assert "pip install 'posematch[train]'" in str(result.exception)
