@@ -22,7 +22,8 @@ from collections.abc import Callable
 from http import HTTPStatus
 from typing import ClassVar
 
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn._types import ASGI3Application
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
 from app.errors import PROBLEM_TYPE_PREFIX
 
@@ -41,14 +42,16 @@ class Connection(HttpToolsProtocol):
         """Start waiting for the first head."""
         super().connection_made(transport)
         self._timers: dict[str, asyncio.TimerHandle] = {}
+        self._running: RequestResponseCycle | None = None
         self._head_bytes = 0
         self._in_body = False
         self._expect("head", self.transport.close)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget all timers."""
+        """Forget all timers, and answers under way."""
         for name in tuple(self._timers):
             self._arrived(name)
+        self._disconnect()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -87,12 +90,12 @@ class Connection(HttpToolsProtocol):
         """The answer is written, perhaps before its request was read to the end."""
         super().on_response_complete()
         if self.cycle.more_body and not self.transport.is_closing():
-            self._expect("rest", self.transport.abort)
+            self._expect("rest", self._give_up)
 
     def pause_writing(self) -> None:
         """The client does not read as fast as it is answered."""
         super().pause_writing()
-        self._expect("reader", self.transport.abort)
+        self._expect("reader", self._give_up)
 
     def resume_writing(self) -> None:
         """The client has read on."""
@@ -120,10 +123,28 @@ class Connection(HttpToolsProtocol):
         begun = cycle is not None and cycle.response_started and not cycle.response_complete
         if not begun and not self.pipeline:
             self.transport.write(_encode_problem(HTTPStatus(status), slug, detail))
-        if cycle is not None:
-            cycle.disconnected = True  # what is computed for it has nowhere to go
-            cycle.message_event.set()
+        self._disconnect()
         self.transport.close()
+
+    def _give_up(self) -> None:
+        """Drop the connection, and all that waits to be written to it."""
+        self._disconnect()
+        self.transport.abort()
+
+    def _start_asgi_task(self, cycle: RequestResponseCycle, app: ASGI3Application) -> None:
+        self._running = cycle
+        super()._start_asgi_task(cycle, app)
+
+    def _disconnect(self) -> None:
+        """Tell the requests there are that their answers have nowhere to go.
+
+        uvicorn tells the one that came last, and that when the connection is lost; the one that is
+        being answered may wake up before that, and would write to the closed transport.
+        """
+        for cycle in (self._running, self.cycle):
+            if cycle is not None:
+                cycle.disconnected = True
+                cycle.message_event.set()
 
 
 def connection_class(patience_s: float) -> type[Connection]:

@@ -127,6 +127,7 @@ def test_who_does_not_read_is_cut_off(server: Server) -> None:
                 received += len(piece)
         assert received < 100 * 80_000
     assert server.client.get("/livez").status_code == 200
+    assert "Traceback" not in server.log.read_text(), "a connection given up is no error"
 
 
 def test_old_and_odd_clients(server: Server, photo: bytes) -> None:
