@@ -31,7 +31,7 @@ LIBRARY_SIGMAS_PX = (10.0, 15.0, 20.0, 30.0, 40.0, 55.0, 80.0)
 STATED_FLOOR_PX = 0.5
 PROBABILITY_EDGES = (0.0, 0.02, 0.04, 0.06, 0.08, 0.12, 1.0)
 NOISE_MM_PER_PX = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0, 30.0)
-LEVEL_TOLERANCE = 0.04
+LEVEL_TOLERANCE = 0.045
 """How far the coverage of one noise level may be off, on the people fitted on."""
 
 

@@ -51,6 +51,7 @@ FORESHORTENED_DEG = 25.0
 """A limb nearer than this to its line of sight shows less than 42% of its length."""
 ROLLS_DEG = (90.0, 180.0)
 CANDIDATES = (1, 3, 5, 10)
+ERRORS = {"P1": rigid_error_mm, "P2": root_centred_error_mm, "PA": similarity_error_mm}
 
 Mask = npt.NDArray[np.bool_]
 
@@ -131,7 +132,7 @@ def print_rejection(data: LiftingSet, answers: dict[int, Lifted]) -> None:
     print("|---|---|---|---|---|---|")
     for noise, lifted in answers.items():
         assert lifted.sigma_mm is not None
-        for name, measure in (("P1", rigid_error_mm), ("P2", root_centred_error_mm)):
+        for name, measure in ERRORS.items():
             error = measure(lifted.joints_mm, data.joints_3d_mm).mean(1)
             found = rejection(error, lifted.sigma_mm.mean(1))
             print(

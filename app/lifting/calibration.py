@@ -6,7 +6,7 @@ not fitted on; ``evaluation.calibration`` refits it.
 
 What the constants here rest on: 750 people of five mocap subjects, all joints seen, at 0, 5 and 10
 px of noise together, lifted with a library fitted without these subjects. On 750 other people *of
-the same five subjects* the radius covers 71%, 67% and 68% at the three noise levels. It knows
+the same five subjects* the radius covers 72%, 67% and 66% at the three noise levels. It knows
 nothing of body size, which a photo does not show, and covers less of people of another build
 (docs/accuracy.md). A given subject height scales the radius with the answer but has not been
 calibrated for.
@@ -36,8 +36,8 @@ class SigmaCalibration:
 
 FUSION_SIGMA = SigmaCalibration(
     factors=(
-        0.962, 0.995, 0.962, 1.245, 1.232, 0.938, 1.1,
-        1.181, 0.536, 0.98, 1.042, 0.536, 0.954, 1.028,
+        0.998, 1.061, 1.015, 1.303, 1.274, 0.991, 1.162,
+        1.216, 0.636, 1.028, 1.071, 0.637, 1.002, 1.048,
     ),
-    noise_mm_per_px=8.0,
+    noise_mm_per_px=6.0,
 )  # fmt: skip
