@@ -107,14 +107,18 @@ class Cluster:
             *("--address", address, str(path)),
         ]
 
-        subprocess.run(
-            command,
-            cwd=ROOT,
-            env=self._environment,
-            check=True,
-            capture_output=True,
-            timeout=PATIENCE_S,
-        )
+        for tried in range(1, _STARTS + 1):
+            run = subprocess.run(
+                command,
+                cwd=ROOT,
+                env=self._environment,
+                capture_output=True,
+                text=True,
+                timeout=PATIENCE_S,
+            )
+            if run.returncode == 0:
+                return
+            assert tried < _STARTS, run.stdout + run.stderr
 
     def replicas(self) -> set[int]:
         """The process ids of the replicas that run or are being started."""
