@@ -12,7 +12,7 @@ import numpy as np
 
 from library_store.descriptor import N_JOINTS, Float, describe, normalise
 from library_store.masked import Correlation, missing_limbs
-from library_store.neighbours import Descriptors
+from library_store.neighbours import Descriptors, largest
 
 SAMPLE = 50_000
 """Entries that guesses are taken from."""
@@ -35,7 +35,8 @@ def guesses(sample: Descriptors, query: Float, weights: Float, n: int) -> Descri
     those between are blended.
     """
     similarity = Correlation(query, weights)(sample)
-    nearest = np.argsort(-similarity, kind="stable")[:n]
+    nearest = np.sort(largest(similarity, n))
+    nearest = nearest[np.argsort(-similarity[nearest], kind="stable")]
     # In the query's frame: the visible joints have the same mean and size.
     shares = np.broadcast_to(weights, (len(nearest), N_JOINTS))
     poses = normalise(sample[nearest].reshape(-1, N_JOINTS, 2), shares)
