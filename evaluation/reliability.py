@@ -166,6 +166,11 @@ def print_cases(lifter: Lifter, data: LiftingSet, answers: dict[int, Lifted]) ->
         for noise, lifted in answers.items():
             if chosen.any():
                 print(_case_row(name, noise, lifted, data.joints_3d_mm, chosen))
+    for noise, lifted in answers.items():
+        warned = np.array(["ambiguous_depth" in person.warnings for person in lifted.people])
+        for name, chosen in (("warned of ambiguous_depth", warned), ("not warned", ~warned)):
+            if chosen.any():
+                print(_case_row(name, noise, lifted, data.joints_3d_mm, chosen))
     for angle_deg in ROLLS_DEG:
         turned = rolled(data, angle_deg)
         noise = min(turned.joints_2d_px)
