@@ -70,10 +70,15 @@ def main() -> None:
     parser.add_argument("--backends", nargs="+", choices=get_args(Backend), default=["cells"])
     parser.add_argument("--queries", nargs="+", default=[], metavar="FILE:KEY")
     parser.add_argument("--count", type=int, default=100, help="queries of each case")
+    parser.add_argument("--cases", nargs="+", default=[], help="of the tables' first column")
     parser.add_argument("--passes", type=int, default=3, help="how often each is asked")
     arguments = parser.parse_args()
     points = read_queries(arguments.queries, arguments.count)
-    cases = dict(masks(len(points)))
+    cases = {
+        name: weights
+        for name, weights in masks(len(points))
+        if name in arguments.cases or not arguments.cases
+    }
     for directory in arguments.libraries:
         exact = load(directory, verify=False, backend="exact")
         truth = {name: exact.match(points, mask, max(K)).entries for name, mask in cases.items()}
