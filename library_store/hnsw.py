@@ -1,8 +1,8 @@
 """HNSW graph (hnswlib) for complete queries; masked ones go to the cells.
 
 At 200,000 entries a complete query costs a third of what it does in the cells for 10 neighbours and
-three quarters for 200; the graph takes 260 bytes an entry and minutes to build. hnswlib is the extra
-``hnsw``.
+three quarters for 200; the graph takes 260 bytes an entry and minutes to build. hnswlib is the
+extra ``hnsw``.
 """
 
 from __future__ import annotations
