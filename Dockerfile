@@ -1,9 +1,15 @@
 # The same steps as scripts/setup and scripts/serve: install the lock file, then the project, serve.
 FROM python:3.12-slim AS build
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
+# hadolint ignore=DL3008
+RUN apt-get update \
+    && apt-get install --yes --no-install-recommends g++ \
+    && rm -rf /var/lib/apt/lists/*
 RUN python -m venv /opt/posematch
 WORKDIR /src
 COPY requirements.lock ./
+# Without this, hnswlib is compiled for the building machine's CPU and may not run on another.
+ENV HNSWLIB_NO_NATIVE=1
 RUN /opt/posematch/bin/python -m pip install --no-cache-dir --disable-pip-version-check \
     --require-hashes --requirement requirements.lock
 COPY pyproject.toml README.md LICENSE ./

@@ -17,8 +17,8 @@ _SPDX = {
     "BSD-3-Clause": "BSD-3-Clause",
 }
 """What packages without a licence expression say, in such expressions."""
-_ELSEWHERE = {"colorama": "BSD-3-Clause"}
-"""Packages that are installed on some other system."""
+_BY_HAND = {"colorama": "BSD-3-Clause", "hnswlib": "Apache-2.0"}
+"""Packages that only another system installs, and those that say it in their licence file alone."""
 
 
 def locked_packages() -> list[str]:
@@ -29,8 +29,8 @@ def locked_packages() -> list[str]:
 
 def licence_of(package: str) -> str:
     """SPDX expression of an installed package; ``KeyError`` when it says something unknown."""
-    if package in _ELSEWHERE:
-        return _ELSEWHERE[package]
+    if package in _BY_HAND:
+        return _BY_HAND[package]
     said = metadata.metadata(package)
     if "License-Expression" in said:
         return str(said["License-Expression"])

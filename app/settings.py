@@ -112,7 +112,7 @@ class Settings(BaseSettings):
     index: Backend = Field(
         "auto",
         description="What finds neighbours: cells (of every library), exact (every exemplar "
-        "compared), hnsw (where the library was built with it) or milvus; auto is the one that "
+        "compared), hnsw (where the library has a graph) or milvus; auto is the one that "
         "the library was built for.",
     )
     milvus_uri: str | None = Field(

@@ -13,7 +13,7 @@ milvus    a Milvus server, where the library was pushed to it
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -32,10 +32,10 @@ DESCRIPTORS_FILE = "descriptors.npy"
 
 @dataclass(frozen=True)
 class IndexSettings:
-    """What a library's index is built with: cells always, a graph beside them if wanted."""
+    """What a library's index is built with: a graph, and the cells that masked queries need."""
 
     rows_per_cell: int = ROWS_PER_CELL
-    hnsw: HnswSettings | None = None
+    hnsw: HnswSettings | None = field(default_factory=HnswSettings)
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -74,8 +74,8 @@ def resolve(backend: Backend, manifest: Manifest) -> Backend:
         return chosen
     if backend == "hnsw" and HNSW_FILE not in manifest.files:
         raise LibraryError(
-            f"the library {manifest.name} has no HNSW graph; build it with `posematch library "
-            "build --hnsw`, or serve it with POSEMATCH_INDEX=auto"
+            f"the library {manifest.name} has no HNSW graph; build it without "
+            "--no-hnsw, or serve it with POSEMATCH_INDEX=auto"
         )
     return backend
 

@@ -1,8 +1,7 @@
 """HNSW graph (hnswlib) for complete queries; masked ones go to the cells.
 
 At 200,000 entries a complete query costs a third of what it does in the cells for 10 neighbours and
-three quarters for 200; the graph takes 260 bytes an entry and minutes to build. hnswlib is the
-extra ``hnsw``.
+three quarters for 200; the graph takes 260 bytes an entry and most of the time of a build.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import hnswlib
 import numpy as np
 
 from library_store.cell_index import CellIndex
@@ -144,11 +144,4 @@ def ef_for(n: int) -> int:
 
 
 def _new_graph() -> Any:
-    try:
-        import hnswlib
-    except ImportError:
-        raise LibraryError(
-            "an HNSW index needs the package hnswlib: pip install 'posematch[hnsw]', "
-            "or use the index 'cells'"
-        ) from None
     return hnswlib.Index(space="l2", dim=DIMENSIONS)

@@ -45,7 +45,8 @@ LibraryArgument = Annotated[
 ]
 
 HnswOption = Annotated[
-    bool, typer.Option("--hnsw", help="Index with an HNSW graph (extra `hnsw`), not cells alone.")
+    bool,
+    typer.Option(help="Index with an HNSW graph; without it the cells serve complete poses too."),
 ]
 
 
@@ -94,7 +95,7 @@ def build(
     name: Annotated[str, typer.Option(help="In exemplar ids; default the directory's.")] = "",
     version: Annotated[str, typer.Option(help="Default the prior's, or 1.")] = "",
     seed: Annotated[int, typer.Option(min=0, help="Another seed gives other poses.")] = 0,
-    hnsw: HnswOption = False,
+    hnsw: HnswOption = True,
 ) -> None:
     """Build a library from clips, from a pose prior or both.
 
@@ -173,7 +174,7 @@ def merge(
     directory: Annotated[Path, typer.Option(help="Write the merged library here.")],
     name: Annotated[str, typer.Option(help="In exemplar ids; default the directory's.")] = "",
     version: Annotated[str, typer.Option(help="The new library's.")] = "1",
-    hnsw: HnswOption = False,
+    hnsw: HnswOption = True,
 ) -> None:
     """Make one library of several, without building their parts anew."""
     try:

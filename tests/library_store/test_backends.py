@@ -54,9 +54,14 @@ def test_files_that_are_not_needed_may_be_damaged(graph_directory: Path, prior: 
         load(damaged)
 
 
-def test_a_graph_that_was_not_built_is_not_searched(small_directory: Path) -> None:
-    with pytest.raises(LibraryError, match=r"--hnsw.*POSEMATCH_INDEX=auto"):
-        load(small_directory, backend="hnsw")
+def test_a_graph_that_was_not_built_is_not_searched(prior: PosePrior, tmp_path: Path) -> None:
+    plain = tmp_path / "plain"
+    without = IndexSettings(hnsw=None)
+    manifest = build_library(plain, prior, BuildSettings(name="plain", n_poses=200, index=without))
+    assert HNSW_FILE not in manifest.files
+    load(plain).close()
+    with pytest.raises(LibraryError, match=r"--no-hnsw.*POSEMATCH_INDEX=auto"):
+        load(plain, backend="hnsw")
 
 
 def test_milvus_must_be_somewhere(small_directory: Path) -> None:

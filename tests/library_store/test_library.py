@@ -131,7 +131,7 @@ def test_the_manifest_says_what_the_library_is(small: Library, prior: PosePrior)
 
 def test_the_exact_index_can_be_asked_for(small: Library, small_directory: Path) -> None:
     exact = load(small_directory, backend="exact")
-    assert (exact.index_backend, small.index_backend) == ("exact", "cells")
+    assert (exact.index_backend, small.index_backend) == ("exact", "hnsw")
     points = projections(small, np.arange(0, 4000, 400))
     assert_array_equal(exact.match(points, None, 1).entries, small.match(points, None, 1).entries)
     exact.close()

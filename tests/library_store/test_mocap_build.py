@@ -28,8 +28,9 @@ from library_store.skeleton import R_HIP
 from library_store.sources import Source
 from library_store.steps import LEDGER
 from tests.library_store.clips import clip, write_clips
+from tests.library_store.conftest import ONE_THREAD
 
-SETTINGS = BuildSettings(name="own", n_poses=2_000, seed=3)
+SETTINGS = BuildSettings(name="own", n_poses=2_000, seed=3, index=ONE_THREAD)
 EVERY_FRAME = MocapSettings(radius_mm=0.0)
 
 
@@ -202,14 +203,17 @@ def test_thinning_and_no_mirroring(mocap: Mocap, tmp_path: Path) -> None:
 BUILD = """
 import os, signal, sys
 from pathlib import Path
+from library_store.backends import IndexSettings
 from library_store.build import BuildSettings, Mocap, build_library
+from library_store.hnsw import HnswSettings
 from library_store.mocap import MocapSettings
 
 def stall(stage, done):
     if stage == sys.argv[2]:
         os.kill(os.getpid(), signal.SIGKILL)
 
-settings = BuildSettings(name="own", n_poses=2_000, seed=3)
+index = IndexSettings(hnsw=HnswSettings(threads=1))
+settings = BuildSettings(name="own", n_poses=2_000, seed=3, index=index)
 mocap = Mocap(tuple(map(Path, sys.argv[3:])), MocapSettings(radius_mm=0.0))
 build_library(Path(sys.argv[1]), None, settings, stall, mocap=mocap)
 """
