@@ -10,13 +10,13 @@ CELLS, SIZE = 40, 160
 STRIDE = SIZE // CELLS
 
 
-def gaussians(joints_cells: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Logits (1, 15, CELLS, CELLS) with a peak on each joint."""
+def gaussians(joints_cells: NDArray[np.float64], top: float = -1.0) -> NDArray[np.float32]:
+    """Logits (1, 15, CELLS, CELLS) with a peak of that height on each joint; doubtful ones."""
     y, x = np.mgrid[:CELLS, :CELLS]
     distance2 = (x - joints_cells[:, 0, None, None]) ** 2 + (
         y - joints_cells[:, 1, None, None]
     ) ** 2
-    maps = np.concatenate([-distance2 / 4, np.zeros((1, CELLS, CELLS))])
+    maps = np.concatenate([top - distance2 / 4, np.zeros((1, CELLS, CELLS))])
     return maps[None].astype(np.float32)
 
 
@@ -88,3 +88,18 @@ def test_what_only_the_first_look_sees_stays_its_own() -> None:
     np.testing.assert_allclose(
         both[..., middle, middle], (first[..., middle, middle] + 7) / 2, rtol=1e-6
     )
+
+
+def test_who_is_seen_clearly_is_not_looked_at_again() -> None:
+    clear, doubtful = gaussians(leaning(20), top=2.0), gaussians(leaning(20))
+    seen: list[int] = []
+
+    def run(images: NDArray[np.uint8]) -> NDArray[np.float32]:
+        seen.append(len(images))
+        first = np.concatenate([clear, doubtful, clear])
+        return first if len(seen) == 1 else np.full_like(doubtful, 7.0)
+
+    both = looked_at(run, np.zeros((3, SIZE, SIZE, 3), np.uint8), 2)
+    assert seen == [3, 1]
+    np.testing.assert_array_equal(both[[0, 2]], np.concatenate([clear, clear]))
+    assert not np.array_equal(both[1], doubtful[0])
