@@ -24,8 +24,8 @@ Images = NDArray[np.uint8]
 MIRROR = (*LSP14.mirror, LSP14.n_joints)
 """Maps of the mirrored person, the background's last."""
 SURE = 0.55
-"""Mean belief at the joints' strongest cells from which the first look is enough: so for a quarter of
-everyday photos, whose second looks would change nothing that could be measured."""
+"""Mean belief at the joints' strongest cells from which the first look is enough: so it is for a
+quarter of everyday photos, whose second looks would change nothing that could be measured."""
 MOST_CHANNELS = 4
 """OpenCV warps that many at once with a constant border."""
 
