@@ -68,20 +68,27 @@ def test_true_joints_give_nearly_the_true_pose(server: Server, renders: list[Ren
 def test_what_was_found_in_a_photo_lifts_to_nearly_the_same(
     server: Server, renders: list[Render]
 ) -> None:
-    """The paper's method takes nothing from the photo but the joints and how sure they are."""
-    (seen,) = boxed(server, renders[0], "method=paper&candidates=0")["people"]
-    body = request_of(renders[0], method="paper", candidates=0, focal_length_px=None)
-    joints = [
-        {
-            key: joint[key]
-            for key in ("name", "x_px", "y_px", "confidence")
-            if joint[key] is not None
-        }
-        for joint in seen["joints_2d"]
-    ]
-    (lifted,) = lift(server, body | {"people": [{"joints_2d": joints}]})
-    apart = joints_mm(lifted) - lifted["root_mm"] - joints_mm(seen) + seen["root_mm"]
-    assert np.linalg.norm(apart, axis=1).mean() < 100
+    """The paper's method takes nothing from the photo but the joints and how sure they are.
+
+    Joints are answered in thousandths of a pixel: where two exemplars explain a photo equally well,
+    that decides between them, so not each of the answers but half of them have to be the same.
+    """
+    apart_mm = []
+    for render in renders:
+        (seen,) = boxed(server, render, "method=paper&candidates=0")["people"]
+        body = request_of(render, method="paper", candidates=0, focal_length_px=None)
+        joints = [
+            {
+                key: joint[key]
+                for key in ("name", "x_px", "y_px", "confidence")
+                if joint[key] is not None
+            }
+            for joint in seen["joints_2d"]
+        ]
+        (lifted,) = lift(server, body | {"people": [{"joints_2d": joints}]})
+        apart = joints_mm(lifted) - lifted["root_mm"] - joints_mm(seen) + seen["root_mm"]
+        apart_mm.append(np.linalg.norm(apart, axis=1).mean())
+    assert np.median(apart_mm) < 100, apart_mm
 
 
 def test_people_do_not_influence_each_other(server: Server, renders: list[Render]) -> None:
