@@ -19,6 +19,7 @@ import httpx
 import yaml
 
 from tests.app.server import free_port
+from tests.deploy.states import States
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "deploy" / "ray_serve.yaml"
@@ -45,6 +46,7 @@ class Cluster:
         self._bin = bin_dir
         self._log = log
         self._gcs_port = free_port()
+        self._address = f"{_NODE}:{self._gcs_port}"
         self.port = free_port()
         self.url = f"http://127.0.0.1:{self.port}"
 
@@ -99,12 +101,20 @@ class Cluster:
         (deployment,) = application["deployments"]
         bounds = {"min_replicas": replicas, "max_replicas": replicas}
         deployment["autoscaling_config"] |= bounds
+        self._serve_run(config)
+
+    def autoscale(self, **autoscaling: float) -> None:
+        """Deploy again with this changed in ``autoscaling_config``, which replaces no replica."""
+        config = yaml.safe_load((self._directory / "config.yaml").read_text())
+        config["applications"][0]["deployments"][0]["autoscaling_config"] |= autoscaling
+        self._serve_run(config)
+
+    def _serve_run(self, config: object) -> None:
         path = self._directory / "config.yaml"
         path.write_text(yaml.safe_dump(config))
-        address = f"{_NODE}:{self._gcs_port}"
         command = [
             *(str(self._bin / "serve"), "run", "--non-blocking"),
-            *("--address", address, str(path)),
+            *("--address", self._address, str(path)),
         ]
 
         for tried in range(1, _STARTS + 1):
@@ -123,6 +133,10 @@ class Cluster:
     def replicas(self) -> set[int]:
         """The process ids of the replicas that run or are being started."""
         return {pid for pid in self._members() if _command(pid).startswith(REPLICA)}
+
+    def states(self, log: Path) -> States:
+        """What Ray says of the replicas, watched for the time of a ``with`` block."""
+        return States(self._bin, self._address, log, self._environment)
 
     def answering(self, asked: int = 12) -> dict[str, int]:
         """Which replicas answer /metrics: when each started -> how many photos it has answered."""

@@ -163,3 +163,33 @@ def test_a_redeploy_under_load_fails_no_request(cluster: Cluster, library_dir: P
         limits = client.get("/v1/info").json()["limits"]
     assert set(load.outcomes) == {200}, load.outcomes
     assert limits["max_body_bytes"] == 1_000_000
+
+
+def test_replicas_come_and_go_with_the_load(cluster: Cluster, tmp_path: Path) -> None:
+    """From one to two and back, and no request fails, without asking again."""
+    # Two under way for each replica, as deployed; all else quicker, for a test.
+    cluster.autoscale(
+        min_replicas=1,
+        max_replicas=REPLICAS,
+        metrics_interval_s=1,
+        look_back_period_s=3,
+        upscale_delay_s=2,
+        downscale_delay_s=3,
+    )
+    with (
+        httpx.Client(base_url=cluster.url, timeout=90) as client,
+        cluster.states(tmp_path / "states") as states,
+    ):
+
+        def ask() -> int:
+            return client.post("/v1/poses", content=PHOTO).status_code
+
+        wait_until(lambda: states.are(1), "one replica is enough for nobody")
+        with Load(ask, clients=1) as one:
+            with Load(ask, clients=4) as four:
+                wait_until(lambda: states.are(2), "a second replica for five clients")
+                wait_until(lambda: len(cluster.answering()) == REPLICAS, "both answer")
+                four.goes_on()
+            wait_until(lambda: states.are(1), "one replica for the client that is left")
+            one.goes_on()
+    assert set(one.outcomes + four.outcomes) == {200}, (one.outcomes, four.outcomes)
