@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-import sys
 from importlib import metadata
 from pathlib import Path
+
+from app.page_table import renew_page, with_table
 
 START, END = "<!-- dependencies: scripts/licences-table -->", "<!-- end of dependencies -->"
 LOCK = Path(__file__).resolve().parent.parent / "requirements.lock"
@@ -51,16 +52,8 @@ def licences_table() -> str:
 
 def renewed(text: str) -> str:
     """``text`` of a page with the table between the two marks renewed."""
-    before, _, rest = text.partition(START)
-    _, _, after = rest.partition(END)
-    return f"{before}{START}\n{licences_table()}\n{END}{after}"
-
-
-def main() -> None:
-    """Renew the page named on the command line."""
-    page = Path(sys.argv[1])
-    page.write_text(renewed(page.read_text()))
+    return with_table(text, START, END, licences_table())
 
 
 if __name__ == "__main__":
-    main()
+    renew_page(renewed)

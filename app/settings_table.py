@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
+from app.page_table import renew_page, with_table
 from app.settings import ENV_PREFIX, Settings
 
 START, END = "<!-- settings: scripts/settings-table -->", "<!-- end of settings -->"
@@ -29,16 +27,8 @@ def settings_table() -> str:
 
 def renewed(text: str) -> str:
     """``text`` of a page with the table between the two marks renewed."""
-    before, _, rest = text.partition(START)
-    _, _, after = rest.partition(END)
-    return f"{before}{START}\n{settings_table()}\n{END}{after}"
-
-
-def main() -> None:
-    """Renew the page named on the command line."""
-    page = Path(sys.argv[1])
-    page.write_text(renewed(page.read_text()))
+    return with_table(text, START, END, settings_table())
 
 
 if __name__ == "__main__":
-    main()
+    renew_page(renewed)

@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
+from app.engine import chosen_networks
+from app.settings import load_settings
 from models import PersonBox, PersonDetector, PoseEstimator
 from models.person_detector import Floats, iou
 from models.presence import present
@@ -128,8 +130,9 @@ def empty_patches(scenes: list[Scene], rng: np.random.Generator) -> list[Image]:
 
 
 def finders() -> dict[str, Find]:
-    """The person network alone, and what the service would answer."""
-    detector, estimator = PersonDetector("person-int8"), PoseEstimator("cpm-int8")
+    """The person network alone, and what the service would answer, with the networks it chooses."""
+    pose, people = chosen_networks(load_settings())
+    detector, estimator = PersonDetector(people), PoseEstimator(pose)
 
     def answered(image: Image) -> list[PersonBox]:
         boxes = detector.detect(image, MOST_PEOPLE)

@@ -22,14 +22,13 @@ from library_store.skeleton import (
     R_WRIST,
 )
 
-_ROOT = -1
-# (length, parent, child), parents first; the root is the origin.
-_BONES = tuple(
+ROOT = -1
+BONES = tuple(
     (LENGTHS.index(name), parent, child)
     for name, parent, child in (
-        ("trunk", _ROOT, NECK),
-        ("hips", _ROOT, R_HIP),
-        ("hips", _ROOT, L_HIP),
+        ("trunk", ROOT, NECK),
+        ("hips", ROOT, R_HIP),
+        ("hips", ROOT, L_HIP),
         ("head", NECK, HEAD_TOP),
         ("shoulder", NECK, R_SHOULDER),
         ("shoulder", NECK, L_SHOULDER),
@@ -43,6 +42,8 @@ _BONES = tuple(
         ("shank", L_KNEE, L_ANKLE),
     )
 )
+"""The segments as (length in ``anatomy.LENGTHS``, parent joint, child joint), parents first; the
+parent of those that start at the origin is ROOT."""
 
 
 def resize(poses: Float, factors: Float) -> Float:
@@ -52,9 +53,9 @@ def resize(poses: Float, factors: Float) -> Float:
     order of ``anatomy.LENGTHS``.
     """
     resized = np.zeros_like(poses)
-    for length, parent, child in _BONES:
-        start = 0.0 if parent == _ROOT else poses[:, parent]
-        placed = 0.0 if parent == _ROOT else resized[:, parent]
+    for length, parent, child in BONES:
+        start = 0.0 if parent == ROOT else poses[:, parent]
+        placed = 0.0 if parent == ROOT else resized[:, parent]
         resized[:, child] = placed + factors[:, length, None] * (poses[:, child] - start)
     return resized
 

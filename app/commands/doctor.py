@@ -104,7 +104,7 @@ def examine() -> Iterator[Finding]:
 
 
 def _software() -> Finding:
-    names = ("posematch", "onnxruntime", "numpy", "opencv-python-headless")
+    names = ("posematch", "onnxruntime", "numpy", "hnswlib", "opencv-python-headless")
     versions = [f"Python {sys.version.split()[0]}", *(f"{it} {_version(it)}" for it in names)]
     providers = ", ".join(ort.get_available_providers())
     return Finding("software", "ok", f"{', '.join(versions)}; onnxruntime can use {providers}")

@@ -12,74 +12,46 @@ Overall size is left out: it changes no image.
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from app.lifting.geometry import Floats, Integers
-from library_store.skeleton import (
-    HEAD_TOP,
-    L_ANKLE,
-    L_ELBOW,
-    L_HIP,
-    L_KNEE,
-    L_SHOULDER,
-    L_WRIST,
-    LSP14,
-    NECK,
-    R_ANKLE,
-    R_ELBOW,
-    R_HIP,
-    R_KNEE,
-    R_SHOULDER,
-    R_WRIST,
-)
+from library_store.anatomy import LENGTHS
+from library_store.proportions import BONES, ROOT
+from library_store.skeleton import LSP14
 
-_ROOT = -1
-# Kinds of segments, each as chains of joints from the root outwards.
-_CHAINS: tuple[tuple[int, ...], ...] = (
-    (_ROOT, NECK, HEAD_TOP),
-    (NECK, R_SHOULDER, R_ELBOW, R_WRIST),
-    (NECK, L_SHOULDER, L_ELBOW, L_WRIST),
-    (_ROOT, R_HIP, R_KNEE, R_ANKLE),
-    (_ROOT, L_HIP, L_KNEE, L_ANKLE),
-)
-_KINDS: tuple[tuple[int, ...], ...] = (
-    (NECK,),
-    (HEAD_TOP,),
-    (R_SHOULDER, L_SHOULDER),
-    (R_ELBOW, L_ELBOW),
-    (R_WRIST, L_WRIST),
-    (R_HIP, L_HIP),
-    (R_KNEE, L_KNEE),
-    (R_ANKLE, L_ANKLE),
-)
-"""Segments of one length, by the joint each ends at: trunk, head, shoulder, upper arm, forearm,
-hip, thigh, shank."""
-_STATURE = (0.33, 0.15, 0.0, 0.0, 0.0, 0.0, 0.25, 0.27)
-"""Shares of the kinds in standing height."""
+_SHARE_OF_HEIGHT = {
+    "trunk": 0.33,
+    "head": 0.15,
+    "shoulder": 0.0,
+    "upper_arm": 0.0,
+    "forearm": 0.0,
+    "hips": 0.0,
+    "thigh": 0.25,
+    "shank": 0.27,
+}
+"""The kinds of segments, and what each adds to the standing height."""
 
 
 def _contributions() -> Floats:
     """(8, J, J): row j of matrix g, times a root-centred pose: what segments g add to joint j."""
-    parent = {child: start for chain in _CHAINS for start, child in pairwise(chain)}
-    matrices = np.zeros((len(_KINDS), LSP14.n_joints, LSP14.n_joints))
+    kinds = list(_SHARE_OF_HEIGHT)
+    chain = {child: (kinds.index(LENGTHS[length]), parent) for length, parent, child in BONES}
+    matrices = np.zeros((len(kinds), LSP14.n_joints, LSP14.n_joints))
     for joint in range(LSP14.n_joints):
         end = joint
-        while end != _ROOT:
-            kind = next(number for number, ends in enumerate(_KINDS) if end in ends)
+        while end != ROOT:
+            kind, start = chain[end]
             matrices[kind, joint, end] += 1.0
-            if parent[end] != _ROOT:
-                matrices[kind, joint, parent[end]] -= 1.0
-            end = parent[end]
+            if start != ROOT:
+                matrices[kind, joint, start] -= 1.0
+            end = start
     return matrices
 
 
 def _directions() -> Floats:
     """(7, J, J): independent directions of unit spread in log lengths, at one size."""
-    n = len(_KINDS)
-    share = np.array(_STATURE)
-    covariance = np.eye(n) - np.outer(share, share) / (share @ share)
+    share = np.array(list(_SHARE_OF_HEIGHT.values()))
+    covariance = np.eye(len(share)) - np.outer(share, share) / (share @ share)
     values, vectors = np.linalg.eigh(covariance)
     kept = vectors[:, values > 0.5].T
     directions: Floats = np.einsum("dg,gij->dij", kept, _contributions())
@@ -97,13 +69,19 @@ def proportion_directions(poses_mm: Floats) -> Floats:
     return _DIRECTIONS @ poses_mm
 
 
-SYMMETRIC_SEGMENTS: tuple[tuple[tuple[int, int], tuple[int, int]], ...] = (
-    ((NECK, R_SHOULDER), (NECK, L_SHOULDER)),
-    ((R_SHOULDER, R_ELBOW), (L_SHOULDER, L_ELBOW)),
-    ((R_ELBOW, R_WRIST), (L_ELBOW, L_WRIST)),
-    ((R_HIP, R_KNEE), (L_HIP, L_KNEE)),
-    ((R_KNEE, R_ANKLE), (L_KNEE, L_ANKLE)),
-)
+Segment = tuple[int, int]
+
+
+def _paired_segments() -> tuple[tuple[Segment, Segment], ...]:
+    """The right and the left of each kind of limb, and of the shoulders: (parent, child)."""
+    pairs = []
+    for kind in ("shoulder", "upper_arm", "forearm", "thigh", "shank"):
+        right, left = ((a, b) for length, a, b in BONES if LENGTHS[length] == kind)
+        pairs.append((right, left))
+    return tuple(pairs)
+
+
+SYMMETRIC_SEGMENTS = _paired_segments()
 _STARTS: Integers = np.array([[a, b] for (a, _), (b, _) in SYMMETRIC_SEGMENTS])
 _ENDS: Integers = np.array([[a, b] for (_, a), (_, b) in SYMMETRIC_SEGMENTS])
 

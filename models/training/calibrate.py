@@ -195,7 +195,7 @@ def main() -> None:
         data = read_all(model, output, [canonical(c, output.input_px) for c in kept[name]])
         measured[f"pck_0.2/{name}/14_joints"] = round(accuracy(data, tuple(range(14))), 4)
         measured[f"pck_0.2/{name}/12_limb_joints"] = round(accuracy(data, LIMB_JOINTS), 4)
-    measured["command"] = "python -m models.training.calibrate --data DIR"
+    measured["command"] = f"python -m models.training.calibrate --data DIR --name {args.name}"
     held_text = "half of the held-out photos and labelled crops; checked on the other half"
     updated = card.model_copy(
         update={

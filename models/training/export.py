@@ -37,6 +37,7 @@ PHOTO_PX = 320
 """Default for the longer side of the photo that the person network sees."""
 LABELLED = "Leeds Sports Pose Extended (Johnson & Everingham 2011, research use), human labels"
 PHOTOS = "web photos of everyday and sport poses, labels by BlazePose heavy and a mobile CPM"
+RENDERED = "rendered people: MakeHuman bodies (CC0) in CMU mocap poses"
 SCENES = "whole street and sport scenes, boxes by the BlazePose detector and landmark network"
 RESEARCH = (
     "trained partly on images published for research use: judge whether that suits a commercial use"
@@ -108,7 +109,7 @@ def pose_card(network: ConvolutionalPoseMachine, name: str, version: str, size: 
             target_sigma_cells=FINE_SIGMA_CELLS,
             maps="logits",
         ),
-        training_data=[LABELLED, PHOTOS],
+        training_data=[LABELLED, PHOTOS, RENDERED],
         licence="Apache-2.0 (weights); the training images keep their own terms",
         limits=[
             "one person per crop, the one in its centre",
@@ -137,7 +138,7 @@ def person_card(network: PersonNetwork, name: str, version: str, size: int) -> M
             unit_px=UNIT_PX,
             threshold=DETECTOR_THRESHOLD,
         ),
-        training_data=[LABELLED, PHOTOS, SCENES],
+        training_data=[LABELLED, PHOTOS, RENDERED, SCENES],
         licence="Apache-2.0 (weights); the training images keep their own terms",
         limits=[
             "people smaller than a tenth of the photo's longer side are often missed",
