@@ -73,9 +73,16 @@ class UploadMemory:
 
 
 async def read_body(
-    request: Request, *, limit_bytes: int, timeout_s: float, take: Callable[[int], None]
+    request: Request,
+    *,
+    limit_bytes: int,
+    timeout_s: float,
+    take: Callable[[int], None],
+    wanted: str = "the bytes of an image",
 ) -> bytes:
     """The whole body; ``take`` is asked for every piece of it (see ``UploadMemory``).
+
+    ``wanted`` is what to send, for whoever sent nothing.
 
     Raises ``BodyTooLargeError`` as soon as the stated or the counted length passes the limit,
     ``UploadTooSlowError`` when it is not complete in time, ``EmptyBodyError``, or
@@ -103,7 +110,7 @@ async def read_body(
     except TimeoutError:
         raise UploadTooSlowError(f"the body was not complete after {timeout_s:g} s") from None
     if size == 0:
-        raise EmptyBodyError("the body is empty; send the bytes of an image")
+        raise EmptyBodyError(f"the body is empty; send {wanted}")
     return b"".join(chunks)
 
 

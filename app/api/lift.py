@@ -47,6 +47,7 @@ async def lift_people(request: Request, service: ServiceDep, engine: EngineDep) 
             limit_bytes=min(MAX_LIFT_BODY_BYTES, service.settings.max_body_bytes),
             timeout_s=service.settings.upload_timeout_s,
             take=take,
+            wanted="2D joints as JSON",
         )
         with WatchedArrival(request.receive) as arrival:
 

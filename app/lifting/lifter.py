@@ -6,6 +6,7 @@ bytes whoever else is in the call.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -38,6 +39,10 @@ MIN_TRUNK_JOINTS = 2
 TRUNK = (NECK, R_SHOULDER, L_SHOULDER, R_HIP, L_HIP)
 MIN_EXTENT_PX = 8.0
 """Larger side of the joints' bounding box, pixels of the photo."""
+MAX_SPREAD_DEG = 70.0
+"""Angle of a joint's ray from the person's centre: wider, and no camera has seen them whole."""
+MAX_OFF_AXIS_DEG = 85.0
+"""Angle of the person's centre from the optical axis; at 90 it is in no picture."""
 
 
 @dataclass(frozen=True)
@@ -146,12 +151,12 @@ class Lifter:
         confidence = np.where(
             person.confidence >= settings.least_confidence, person.confidence, 0.0
         )
+        truncated = ("truncated",) if (confidence == 0).any() else ()
         refusal = _why_not_liftable(person.joints_px, confidence)
         if refusal is not None:
-            return NotLiftable(refusal, ("truncated",))
+            return NotLiftable(refusal, truncated)
         warnings = ["assumed_focal"] if intrinsics.source == "assumed" else []
-        if (confidence == 0).any():
-            warnings.append("truncated")
+        warnings.extend(truncated)
 
         outliers = 0
         while True:
@@ -162,6 +167,9 @@ class Lifter:
                 intrinsics.focal_length_px,
                 np.array(intrinsics.principal_point_px),
             )
+            refusal = _why_not_seen(view)
+            if refusal is not None:
+                return NotLiftable(refusal, tuple(warnings))
             neighbours = self._neighbours(view, confidence > 0, method)
             lap("match")
             if method == "paper":
@@ -195,6 +203,10 @@ class Lifter:
             noise_px = fused.noise_px
             sigma = settings.sigma(fused.spread_mm, noise_px) if settings.sigma else None
         answer, warped = view.to_photo(answer), view.to_photo(warped)
+        if not (answer[:, 2] > 0).all():
+            return NotLiftable(
+                "no pose in front of the camera explains the joints", tuple(warnings)
+            )
         scale_source: ScaleSource = "library"
         if subject_height_mm is not None:
             scale_source = "request"
@@ -342,4 +354,17 @@ def _why_not_liftable(joints_px: Floats, confidence: Floats) -> str | None:
         )
     if np.ptp(joints_px[present], axis=0).max() < MIN_EXTENT_PX:
         return f"the joints lie within {MIN_EXTENT_PX:g} pixels of each other"
+    return None
+
+
+def _why_not_seen(view: CentredView) -> str | None:
+    """Why no camera sees somebody like that, or None if one may: a wrong focal length, mostly."""
+    remedy = "is the focal length right, in pixels of this photo?"
+    off_axis = view.rotation[2, 2] < math.cos(math.radians(MAX_OFF_AXIS_DEG))
+    if off_axis:
+        return (
+            f"the person is more than {MAX_OFF_AXIS_DEG:g} degrees off the optical axis; {remedy}"
+        )
+    if np.linalg.norm(view.points, axis=1).max() > math.tan(math.radians(MAX_SPREAD_DEG)):
+        return f"the joints span more than {MAX_SPREAD_DEG:g} degrees from their centre; {remedy}"
     return None

@@ -219,6 +219,45 @@ def test_joints_on_one_spot_are_not_lifted(lifter: Lifter) -> None:
     assert isinstance(answer, NotLiftable)
 
 
+@pytest.mark.parametrize(
+    ("focal_length_px", "centre_px", "reason"),
+    [
+        (1.0, (320.0, 240.0), "joints span"),
+        (5.0, (320.0, 240.0), "joints span"),
+        (1150.0, (1e6, 240.0), "off the optical axis"),
+    ],
+)
+@pytest.mark.parametrize("method", METHODS)
+def test_a_camera_that_cannot_be_is_no_reason_to_guess(
+    lifter: Lifter,
+    people: People,
+    method: Method,
+    focal_length_px: float,
+    centre_px: tuple[float, float],
+    reason: str,
+) -> None:
+    camera = Intrinsics(focal_length_px, centre_px, "request")
+    (answer,) = lifter.lift([people.observation(0)], camera, method=method)
+    assert isinstance(answer, NotLiftable)
+    assert reason in answer.reason
+    assert "truncated" not in answer.warnings
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_nobody_is_behind_the_camera(lifter: Lifter, method: Method) -> None:
+    rng = np.random.default_rng(0)
+    scales_px = 10.0 ** rng.uniform(1, 6, 60)
+    centres_px = rng.normal(0, 1, (60, 1, 2)) * 10.0 ** rng.uniform(1, 6, (60, 1, 1))
+    strange = centres_px + scales_px[:, None, None] * rng.normal(0, 1, (60, 14, 2))
+    answers = lifter.lift([observe(joints) for joints in strange], INTRINSICS, method=method)
+    lifted = [answer for answer in answers if isinstance(answer, LiftedPerson)]
+    assert 0 < len(lifted) < len(answers)
+    for person in lifted:
+        for joints_mm in (person.joints_3d_mm, person.warped_mm, person.exemplar.joints_mm):
+            assert (joints_mm[:, 2] > 0).all()
+        assert (np.abs(person.joints_3d_mm) < 1e6).all()
+
+
 def test_a_joint_far_off_is_set_aside(lifter: Lifter, people: People) -> None:
     pixels = people.joints_px[1].copy()
     pixels[10] += [900.0, -900.0]
