@@ -35,7 +35,7 @@ class SceneSample:
     trust: NDArray[np.float32]
 
 
-def _place(
+def place(
     image: Image,
     size: tuple[int, int],
     scale: float,
@@ -43,29 +43,33 @@ def _place(
     flip: bool,
     fill: NDArray[np.float64],
 ) -> tuple[Image, NDArray[np.float32]]:
+    """An image on a canvas of ``size`` (w, h), and the (2, 3) affine that put it there."""
     matrix = np.array([[-scale if flip else scale, 0, shift[0]], [0, scale, shift[1]]])
     flags = cv2.INTER_AREA if scale < 0.6 else cv2.INTER_LINEAR
     placed = cv2.warpAffine(image, matrix, size, flags=flags, borderValue=tuple(fill))
     return placed, matrix.astype(np.float32)
 
 
-def _moved(boxes: NDArray[np.float32], matrix: NDArray[np.float32]) -> NDArray[np.float32]:
+def moved(boxes: NDArray[np.float32], matrix: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Corner boxes (n, 4+) after an affine without rotation, (n, 4)."""
     a = boxes[:, :2] @ matrix[:, :2].T + matrix[:, 2]
     b = boxes[:, 2:4] @ matrix[:, :2].T + matrix[:, 2]
-    moved: NDArray[np.float32] = np.concatenate([np.minimum(a, b), np.maximum(a, b)], 1)
-    return moved
+    corners: NDArray[np.float32] = np.concatenate([np.minimum(a, b), np.maximum(a, b)], 1)
+    return corners
 
 
-def _still_inside(
+def still_inside(
     boxes: NDArray[np.float32], size: tuple[int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Boxes cut at the canvas, and which of them have kept enough of themselves to be found."""
     clipped = np.clip(boxes, 0, np.array([*size, *size], np.float32) - 1)
     area = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
     left = np.prod(clipped[:, 2:] - clipped[:, :2], axis=1)
     return clipped, left > 0.4 * np.maximum(area, 1)
 
 
-def _cells(box: NDArray[np.float32], stride: int = 8) -> tuple[slice, slice]:
+def cells(box: NDArray[np.float32], stride: int = 8) -> tuple[slice, slice]:
+    """Rows and columns of the map at ``stride`` that a corner box touches."""
     x0, y0 = (int(max(v, 0) // stride) for v in box[:2])
     x1, y1 = (int(max(v, 0) // stride) + 1 for v in box[2:4])
     return slice(y0, y1), slice(x0, x1)
@@ -83,12 +87,12 @@ def scene_view(
     shift = rng.uniform(np.minimum(free, 0), np.maximum(free, 0))
     if flip:
         shift[0] += scale * w
-    image, matrix = _place(scene.image, size, scale, shift, flip, rng.uniform(0, 255, 3))
+    image, matrix = place(scene.image, size, scale, shift, flip, rng.uniform(0, 255, 3))
     trust = np.full((size[1] // 8, size[0] // 8), 0.25 if len(scene.people) else 1.0, np.float32)
-    boxes, inside = _still_inside(_moved(scene.people, matrix), size)
+    boxes, inside = still_inside(moved(scene.people, matrix), size)
     score = scene.people[:, 4]
     for box in boxes[inside & (score < SURE)]:
-        trust[_cells(box)] = 0.0
+        trust[cells(box)] = 0.0
     # A sure box says that its surroundings were looked at as well.
     return SceneSample(expose(image, rng), boxes[inside & (score >= SURE)], trust)
 
@@ -105,10 +109,10 @@ def portrait(crop: LabelledCrop, size: tuple[int, int], rng: np.random.Generator
     matrix = np.array([[-scale if flip else scale, 0, 0], [0, scale, 0]])
     matrix[:, 2] = at - mid * (-1 if flip else 1, 1)
     image = cv2.warpAffine(crop.image, matrix, size, borderMode=cv2.BORDER_REPLICATE)
-    boxes, inside = _still_inside(_moved(box, matrix.astype(np.float32)), size)
+    boxes, inside = still_inside(moved(box, matrix.astype(np.float32)), size)
     trust = np.full((size[1] // 8, size[0] // 8), 0.4, np.float32)
     for b in boxes:
-        trust[_cells(b)] = 1.0
+        trust[cells(b)] = 1.0
     return SceneSample(expose(image, rng), boxes[inside], trust)
 
 
@@ -140,7 +144,7 @@ def mosaic(
         size[0] / back.shape[1], size[1] / back.shape[0]
     )
     free = np.array(size) - zoom * np.array(back.shape[1::-1])
-    image, _ = _place(back, size, zoom, rng.uniform(free, 0), False, np.zeros(3))
+    image, _ = place(back, size, zoom, rng.uniform(free, 0), False, np.zeros(3))
     _paste_decoys(image, empty, rng)
     trust = np.ones((size[1] // 8, size[0] // 8), np.float32)
     boxes: list[NDArray[np.float32]] = []
@@ -156,12 +160,12 @@ def mosaic(
         at = rng.uniform(-0.05, 1.05, 2) * size
         mid = (box[0, :2] + box[0, 2:]) / 2 * scale
         shift = at - mid * (-1 if flip else 1, 1)
-        placed, matrix = _place(crop.image, size, scale, shift, flip, np.zeros(3))
-        moved, inside = _still_inside(_moved(box, matrix), size)
+        placed, matrix = place(crop.image, size, scale, shift, flip, np.zeros(3))
+        shown, inside = still_inside(moved(box, matrix), size)
         corners = np.array([[0, 0, crop.image.shape[1] - 1, crop.image.shape[0] - 1]], np.float32)
-        whole = _moved(corners, matrix)[0]
+        whole = moved(corners, matrix)[0]
         # How much of the crop's own background comes along varies, so that seams teach nothing.
-        keep = _moved(box, matrix)[0]
+        keep = moved(box, matrix)[0]
         margin = rng.uniform(0.04, 0.35, 4) * extent * scale
         keep = np.clip(
             keep + margin * (-1, -1, 1, 1), [*whole[:2], *whole[:2]], [*whole[2:], *whole[2:]]
@@ -178,8 +182,8 @@ def mosaic(
         if covered:
             continue
         image[y0:y1, x0:x1] = placed[y0:y1, x0:x1]
-        trust[_cells(keep)] = 0.4  # a crop may show others too, nobody labelled them
-        trust[_cells(moved[0])] = 1.0
-        boxes.append(moved[0])
+        trust[cells(keep)] = 0.4  # a crop may show others too, nobody labelled them
+        trust[cells(shown[0])] = 1.0
+        boxes.append(shown[0])
     stacked = np.array(boxes, np.float32).reshape(-1, 4)
     return SceneSample(expose(image, rng), stacked, trust)

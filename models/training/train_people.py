@@ -18,6 +18,7 @@ from torch.nn import functional as F
 
 from models.person_detector import decode, iou
 from models.training import loop
+from models.training.crowds import calm_patches, crowd, whole
 from models.training.dataset import decode_members
 from models.training.network import PersonConfig, PersonNetwork
 from models.training.scenes import UNSURE, LabelledScene, SceneSample, mosaic, portrait, scene_view
@@ -87,6 +88,7 @@ def main() -> None:
     args = parser.parse_args()
 
     crops, _ = read_crops(args.data, args.train, "")
+    entire = [crop for crop in crops if whole(crop)]
     images = decode_members(args.data / args.scenes)
     scenes = [
         LabelledScene(images[r["image"]], np.array(r["people"], np.float32).reshape(-1, 5))
@@ -94,7 +96,17 @@ def main() -> None:
     ]
     dev, train = scenes[::DEV_ONE_IN], [s for i, s in enumerate(scenes) if i % DEV_ONE_IN]
     empty = [s.image for s in train if not len(s.people) or s.people[:, 4].max() < UNSURE]
-    print({"crops": len(crops), "scenes": len(train), "empty": len(empty), "dev": len(dev)})
+    calm = empty + calm_patches(train, np.random.default_rng(args.seed))
+    print(
+        {
+            "crops": len(crops),
+            "whole": len(entire),
+            "scenes": len(train),
+            "empty": len(empty),
+            "calm": len(calm),
+            "dev": len(dev),
+        }
+    )
     width, height = (int(v) for v in args.canvas.split("x"))
     canvas, stride = (width, height), PersonNetwork.STRIDE
 
@@ -106,10 +118,12 @@ def main() -> None:
 
     def sample(rng: np.random.Generator) -> SceneSample:
         dice = rng.random()
-        if dice < 0.4:
+        if dice < 0.3:
             return scene_view(train[rng.integers(len(train))], canvas, rng)
-        if dice < 0.65:
+        if dice < 0.45:
             return portrait(crops[rng.integers(len(crops))], canvas, rng)
+        if dice < 0.75:
+            return crowd(entire, calm, train, canvas, rng)
         return mosaic(crops, empty, canvas, rng)
 
     def make_batch(step: int, size: int) -> loop.Batch:  # noqa: ARG001

@@ -1,0 +1,204 @@
+"""Crowds for the person network: people cut out along their limbs, set before and behind others.
+
+Whole crops pasted side by side (scenes.mosaic) never overlap, people in photos do. Here a person
+is cut out by thick strokes along the labelled bones, so that others stay visible around the limbs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from library_store.skeleton import (
+    HEAD_TOP,
+    L_ANKLE,
+    L_ELBOW,
+    L_HIP,
+    L_KNEE,
+    L_SHOULDER,
+    L_WRIST,
+    NECK,
+    R_ANKLE,
+    R_ELBOW,
+    R_HIP,
+    R_KNEE,
+    R_SHOULDER,
+    R_WRIST,
+)
+from models.training.augment import expose
+from models.training.dataset import Image, LabelledCrop
+from models.training.scenes import (
+    LabelledScene,
+    SceneSample,
+    cells,
+    moved,
+    place,
+    scene_view,
+    still_inside,
+)
+
+Mask = NDArray[np.float32]
+STROKES = (
+    (R_SHOULDER, R_ELBOW, 0.34),
+    (R_ELBOW, R_WRIST, 0.3),
+    (L_SHOULDER, L_ELBOW, 0.34),
+    (L_ELBOW, L_WRIST, 0.3),
+    (R_HIP, R_KNEE, 0.46),
+    (R_KNEE, R_ANKLE, 0.38),
+    (L_HIP, L_KNEE, 0.46),
+    (L_KNEE, L_ANKLE, 0.38),
+)
+"""Two joints and how wide the limb between them is cut, over the trunk's size. Generous: a seam
+within the clothes would cost more than a rim of background."""
+TRUNK = (R_SHOULDER, L_SHOULDER, L_HIP, R_HIP)
+SEEN, HARDLY_SEEN = 0.45, 0.2
+"""Visible share of somebody from which the box is to be found, and to which nobody can tell."""
+
+
+def silhouette(crop: LabelledCrop) -> Mask:
+    """Roughly where the person is, (h, w) float32 in 0..1, soft at the edge.
+
+    Takes joints without a label as not there: nothing is cut out around them.
+    """
+    known = crop.weight > 0
+    at = np.rint(crop.joints_px * 16).astype(np.int32)
+    mask = np.zeros(crop.image.shape[:2], np.uint8)
+    trunk_px = crop.joints_px[list(TRUNK)]
+    sizes = [np.linalg.norm(trunk_px[a] - trunk_px[b]) for a, b in ((0, 2), (1, 3))]
+    size = max(float(max(sizes)), 0.25 * crop.extent_px[1])
+    for a, b, width in STROKES:
+        if known[a] and known[b]:
+            thick = max(2, round(width * size))
+            cv2.line(mask, at[a].tolist(), at[b].tolist(), 255, thick, cv2.LINE_8, 4)
+    corners = at[[j for j in TRUNK if known[j]]]
+    if len(corners) >= 2:
+        cv2.fillPoly(mask, [corners], 255, cv2.LINE_8, 4)
+        cv2.polylines(mask, [corners], True, 255, max(2, round(0.34 * size)), cv2.LINE_8, 4)
+    if known[HEAD_TOP] and known[NECK]:
+        head = np.linalg.norm(crop.joints_px[HEAD_TOP] - crop.joints_px[NECK])
+        middle = (0.55 * at[HEAD_TOP] + 0.45 * at[NECK]).astype(np.int32)
+        cv2.circle(mask, middle.tolist(), max(2, round(0.55 * head * 16)), 255, -1, cv2.LINE_8, 4)
+        cv2.line(mask, at[NECK].tolist(), middle.tolist(), 255, max(2, round(0.4 * head)), 8, 4)
+    return (cv2.GaussianBlur(mask, (0, 0), 1.5) / 255).astype(np.float32)
+
+
+@dataclass
+class Member:
+    """Somebody in the picture so far: the box, the share of the canvas covered and still seen."""
+
+    box: NDArray[np.float32]
+    mask: Mask | None
+    area: float
+    seen: float
+
+    @property
+    def share(self) -> float:
+        """How much of the person can still be seen, 0..1."""
+        return self.seen / max(self.area, 1.0)
+
+    def hide_behind(self, front: Mask) -> None:
+        """Take off what ``front`` (canvas) hides of this person."""
+        if self.mask is None:  # known by the box alone
+            rows, columns = cells(self.box, 1)
+            self.seen -= float(front[rows, columns].sum())
+        else:
+            self.mask *= 1 - front
+            self.seen = float(self.mask.sum())
+
+
+def whole(crop: LabelledCrop) -> bool:
+    """Whether all of the limbs' and the trunk's joints are labelled."""
+    return bool((crop.weight[NECK + 1 :] > 0).all())
+
+
+def crowd(
+    crops: list[LabelledCrop],
+    backs: list[Image],
+    scenes: list[LabelledScene],
+    size: tuple[int, int],
+    rng: np.random.Generator,
+) -> SceneSample:
+    """Two to six people of similar size who overlap, before a scene or a background; (w, h) px.
+
+    ``crops`` should know all their joints (``whole``): what has no label is not cut out.
+    """
+    if rng.random() < 0.5:
+        scene = scene_view(scenes[rng.integers(len(scenes))], size, rng)
+        image, trust = scene.image, scene.trust
+        areas = np.prod(scene.boxes[:, 2:] - scene.boxes[:, :2], axis=1)
+        members = [
+            Member(box, None, float(area), float(area))
+            for box, area in zip(scene.boxes, areas, strict=True)
+        ]
+    else:
+        back = backs[rng.integers(len(backs))]
+        zoom = max(size[0] / back.shape[1], size[1] / back.shape[0])
+        zoom *= float(np.exp(rng.uniform(0, 0.7)))
+        free = np.array(size) - zoom * np.array(back.shape[1::-1])
+        image, _ = place(back, size, zoom, rng.uniform(free, 0), False, np.zeros(3))
+        trust = np.full((size[1] // 8, size[0] // 8), 0.6, np.float32)
+        members = []
+    height = float(np.exp(rng.uniform(np.log(36), np.log(0.9 * size[1]))))
+    middle = rng.uniform(0.15, 0.85, 2) * size
+    unsure: list[NDArray[np.float32]] = []
+    for _ in range(rng.integers(2, 7)):
+        crop = crops[rng.integers(len(crops))]
+        known = crop.joints_px[crop.weight > 0]
+        box = np.concatenate([known.min(0), known.max(0)])[None].astype(np.float32)
+        extent = float((box[0, 2:] - box[0, :2]).max())
+        scale = height * float(np.exp(rng.normal(0, 0.15))) / extent
+        flip = bool(rng.random() < 0.5)
+        shift = middle - (box[0, :2] + box[0, 2:]) / 2 * scale * (-1 if flip else 1, 1)
+        fill = np.zeros(3)
+        placed, matrix = place(crop.image, size, scale, shift, flip, fill)
+        boxes, inside = still_inside(moved(box, matrix), size)
+        # The next one stands beside, at arm's length or closer.
+        side = 1 if rng.random() < 0.5 else -1
+        width = float(boxes[0, 2] - boxes[0, 0])
+        middle[0] += side * rng.uniform(0.3, 1.0) * max(width, 0.3 * height)
+        middle = np.clip(middle + rng.normal(0, 0.08 * height, 2), 0, size)
+        if not inside[0]:
+            continue
+        front, _ = place(silhouette(crop), size, scale, shift, flip, fill)
+        blend = front[..., None]
+        image = (image * (1 - blend) + placed * blend + 0.5).astype(np.uint8)
+        for member in members:
+            member.hide_behind(front)
+        area = float(front.sum())
+        members.append(Member(boxes[0], front.copy(), area, area))
+    visible = []
+    for member in members:
+        if member.share > SEEN:
+            visible.append(member.box)
+        elif member.share > HARDLY_SEEN:
+            unsure.append(member.box)
+    for box in unsure:
+        trust[cells(box)] = 0.0
+    for box in visible:
+        trust[cells(box)] = 1.0
+    stacked = np.array(visible, np.float32).reshape(-1, 4)
+    return SceneSample(expose(image, rng), stacked, trust)
+
+
+def calm_patches(scenes: list[LabelledScene], rng: np.random.Generator) -> list[Image]:
+    """Up to two patches a scene that come near no box of the teacher's, however unsure."""
+    patches: list[Image] = []
+    for scene in scenes:
+        h, w = scene.image.shape[:2]
+        rim = 0.15 * (scene.people[:, 2:4] - scene.people[:, :2])
+        low, high = scene.people[:, :2] - rim, scene.people[:, 2:4] + rim
+        kept = 0
+        for _ in range(60):
+            side = rng.uniform(0.3, 0.9, 2) * (w, h)
+            corner = rng.uniform(0, 1, 2) * (np.array([w, h]) - side)
+            if ((np.minimum(high, corner + side) > np.maximum(low, corner)).all(1)).any():
+                continue
+            x, y, sw, sh = (int(v) for v in (*corner, *side))
+            patches.append(np.ascontiguousarray(scene.image[y : y + sh, x : x + sw]))
+            kept += 1
+            if kept == 2:
+                break
+    return patches
