@@ -5,7 +5,9 @@ waits, unless the queue is full or its turn would come too late for its deadline
 immediately rather than after waiting in vain. A permit is given back when its thread has really
 ended: a client that vanished must not let a further thread in beside the one still computing.
 
-All bookkeeping happens on the event loop's thread, so it needs no locks.
+What waits lies in the pool's own queue, whole and ready: a worker that ends goes on with the next
+at once, however busy the event loop is refusing others. All bookkeeping happens on the event loop's
+thread, so it needs no locks; workers only note when they began.
 """
 
 from __future__ import annotations
@@ -13,7 +15,6 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -43,9 +44,11 @@ class Arrival:
 
 
 @dataclass(eq=False)
-class _Waiter:
-    turn: asyncio.Future[None]
+class _Job:
+    """Accepted work: how long it should take, and since when a worker is at it (None: waiting)."""
+
     cost_s: float
+    began_s: float | None = None
 
 
 class Admission:
@@ -54,22 +57,20 @@ class Admission:
     def __init__(self, *, workers: int, queue_size: int, deadline_s: float) -> None:
         self._pool = ThreadPoolExecutor(workers, thread_name_prefix="posematch-worker")
         self._workers = workers
-        self._free = workers
         self._queue_size = queue_size
         self._deadline_s = deadline_s
-        self._waiting: deque[_Waiter] = deque()
-        self._ends_s: dict[Future[Any], float] = {}
+        self._jobs: dict[Future[Any], _Job] = {}
         self._mean_s: dict[str, float] = {}
 
     @property
     def running(self) -> int:
         """Permits in use."""
-        return self._workers - self._free
+        return min(len(self._jobs), self._workers)
 
     @property
     def waiting(self) -> int:
         """Requests in the queue."""
-        return len(self._waiting)
+        return len(self._jobs) - self.running
 
     def expect(self, kind: str, seconds: float) -> None:
         """Start the running mean of ``kind`` of work at ``seconds`` (a warm-up's figure)."""
@@ -77,7 +78,7 @@ class Admission:
 
     def check(self, kind: str) -> None:
         """Raise the ``OverloadedError`` that a request whose body came now would meet, if any."""
-        if not self._free:
+        if self.running == self._workers:
             self._refuse_if_hopeless(self._mean_s.get(kind, 0.0), time.monotonic())
 
     async def run(self, kind: str, work: Callable[[], T], arrival: Arrival, *, units: int = 1) -> T:
@@ -88,84 +89,86 @@ class Admission:
         Raises ``OverloadedError`` when refused, ``ClientGoneError`` when the client has left
         before its turn.
         """
-        await self._acquire(self._mean_s.get(kind, 0.0), units, arrival)
-        started_s = time.monotonic()
-        try:
-            thread: Future[T] = self._pool.submit(work)
-        except BaseException:
-            self._release()
-            raise
+        if arrival.gone.done():
+            raise ClientGoneError
+        unit_s = self._mean_s.get(kind, 0.0)
+        wait_s, slack_s = 0.0, None
+        if self.running == self._workers:
+            wait_s, slack_s = self._refuse_if_hopeless(unit_s, arrival.at_s)
+        job = _Job(units * unit_s)
+
+        def begin() -> T:
+            job.began_s = time.monotonic()
+            return work()
+
+        thread = self._pool.submit(begin)
+        self._jobs[thread] = job
         loop = asyncio.get_running_loop()
-        self._ends_s[thread] = started_s + units * self._mean_s.get(kind, 0.0)
 
         def ended(_: Future[T]) -> None:
             if not loop.is_closed():
-                loop.call_soon_threadsafe(self._end, thread, kind, started_s, units)
+                loop.call_soon_threadsafe(self._end, thread, kind, units)
 
         thread.add_done_callback(ended)
-        return await asyncio.wrap_future(thread)
+        answer = asyncio.wrap_future(thread)
+        if slack_s is not None:
+            await self._turn(thread, answer, arrival, wait_s, slack_s)
+        return await answer
 
     def close(self) -> None:
         """Wait for running threads and end the pool."""
         self._pool.shutdown(wait=True, cancel_futures=True)
 
-    async def _acquire(self, unit_s: float, units: int, arrival: Arrival) -> None:
-        if arrival.gone.done():
-            raise ClientGoneError
-        if self._free:
-            self._free -= 1
-            return
-        wait_s, slack_s = self._refuse_if_hopeless(unit_s, arrival.at_s)
-        waiter = _Waiter(asyncio.get_running_loop().create_future(), units * unit_s)
-        self._waiting.append(waiter)
+    async def _turn(
+        self,
+        thread: Future[T],
+        answer: asyncio.Future[T],
+        arrival: Arrival,
+        wait_s: float,
+        slack_s: float,
+    ) -> None:
+        """Wait for the answer until the work must have begun; withdraw it when that is too late."""
+        either: set[asyncio.Future[Any]] = {answer, arrival.gone}
         try:
-            await asyncio.wait(
-                {waiter.turn, arrival.gone},
-                timeout=slack_s,
-                return_when=asyncio.FIRST_COMPLETED,
-            )
+            await asyncio.wait(either, timeout=slack_s, return_when=asyncio.FIRST_COMPLETED)
         except asyncio.CancelledError:
-            self._leave(waiter)
+            self._withdraw(thread)
+            answer.cancel()
             raise
-        if arrival.gone.done():
-            self._leave(waiter)
-            raise ClientGoneError
-        if not waiter.turn.done():
-            self._leave(waiter)
+        if not answer.done() and self._withdraw(thread):
+            if arrival.gone.done():
+                raise ClientGoneError
             raise self._refusal("deadline", wait_s)
+
+    def _withdraw(self, thread: Future[Any]) -> bool:
+        """Take work out of the queue; False when a worker has it already."""
+        withdrawn = thread.cancel()
+        if withdrawn:
+            self._jobs.pop(thread, None)
+        return withdrawn
 
     def _refuse_if_hopeless(self, unit_s: float, at_s: float) -> tuple[float, float]:
         """How long one more request would wait, and how long it may; or ``OverloadedError``."""
         now_s = time.monotonic()
-        backlog_s = sum(waiter.cost_s for waiter in self._waiting)
-        backlog_s += sum(max(0.0, end_s - now_s) for end_s in self._ends_s.values())
+        backlog_s = 0.0
+        for job in self._jobs.values():
+            spent_s = 0.0 if job.began_s is None else now_s - job.began_s
+            backlog_s += max(0.0, job.cost_s - spent_s)
         wait_s = backlog_s / self._workers
         slack_s = at_s + self._deadline_s - unit_s - now_s
-        if len(self._waiting) >= self._queue_size:
+        if self.waiting >= self._queue_size:
             raise self._refusal("queue_full", wait_s)
         if wait_s > slack_s:
             raise self._refusal("deadline", wait_s)
         return wait_s, slack_s
 
-    def _leave(self, waiter: _Waiter) -> None:
-        """Give up a place in the queue, or the permit that was granted meanwhile."""
-        if waiter.turn.done():
-            self._release()
-        else:
-            self._waiting.remove(waiter)
-
-    def _end(self, thread: Future[Any], kind: str, started_s: float, units: int) -> None:
-        del self._ends_s[thread]
-        spent_s = (time.monotonic() - started_s) / units
+    def _end(self, thread: Future[Any], kind: str, units: int) -> None:
+        job = self._jobs.pop(thread, None)
+        if job is None or job.began_s is None:  # withdrawn
+            return
+        spent_s = (time.monotonic() - job.began_s) / units
         mean_s = self._mean_s.get(kind, spent_s)
         self._mean_s[kind] = mean_s + _MEMORY * (spent_s - mean_s)
-        self._release()
-
-    def _release(self) -> None:
-        if self._waiting:
-            self._waiting.popleft().turn.set_result(None)
-        else:
-            self._free += 1
 
     def _refusal(self, reason: str, wait_s: float) -> OverloadedError:
         return OverloadedError(reason, max(1, math.ceil(wait_s)))

@@ -178,6 +178,43 @@ def test_a_cancelled_wait_leaves_the_queue() -> None:
     run(scenario())
 
 
+def test_a_worker_goes_on_with_what_waits_while_the_event_loop_is_busy() -> None:
+    async def scenario() -> None:
+        gate = admission()
+        last = threading.Event()
+        tasks = [
+            asyncio.create_task(gate.run("x", work, arrival()))
+            for work in (lambda: time.sleep(0.02), lambda: None, last.set)
+        ]
+        await asyncio.sleep(0.005)
+        assert (gate.running, gate.waiting) == (1, 2)
+        assert last.wait(5), "all three are done without the loop, which waits here"
+        await asyncio.gather(*tasks)
+        await asyncio.sleep(0.01)
+        assert (gate.running, gate.waiting) == (0, 0)
+        gate.close()
+
+    run(scenario())
+
+
+def test_work_withdrawn_at_its_deadline_is_never_started() -> None:
+    async def scenario() -> None:
+        gate = admission(deadline_s=0.1)
+        gate.expect("x", 0.001)
+        done, ran = threading.Event(), threading.Event()
+        first = asyncio.create_task(gate.run("x", done.wait, arrival()))
+        await asyncio.sleep(0.01)
+        with pytest.raises(OverloadedError) as caught:
+            await gate.run("x", ran.set, arrival())
+        assert caught.value.reason == "deadline"
+        done.set()
+        await first
+        gate.close()
+        assert not ran.is_set()
+
+    run(scenario())
+
+
 def test_errors_of_the_work_come_back_and_free_the_permit() -> None:
     async def scenario() -> None:
         gate = admission()
