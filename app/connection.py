@@ -10,14 +10,16 @@ an answer that the client does not take   closed after ``patience_s``
 ========================================= ==================================================
 
 These errors arise before there is a request, so they are written here, as problem+json like all
-others but without a request id.
+others and with a request id of their own, which the log has too.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import re
+import uuid
 from collections.abc import Callable
 from http import HTTPStatus
 from typing import ClassVar
@@ -26,6 +28,8 @@ from uvicorn._types import ASGI3Application
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
 from app.errors import PROBLEM_TYPE_PREFIX
+
+logger = logging.getLogger("posematch.connection")
 
 MAX_HEAD_BYTES = 65_536
 _UPGRADE = re.compile(rb"(?im)^Upgrade(?=[ \t]*:)")
@@ -122,7 +126,12 @@ class Connection(HttpToolsProtocol):
         cycle = self.cycle
         begun = cycle is not None and cycle.response_started and not cycle.response_complete
         if not begun and not self.pipeline:
-            self.transport.write(_encode_problem(HTTPStatus(status), slug, detail))
+            request_id = uuid.uuid4().hex
+            client = self.client[0] if self.client else None
+            logger.info(
+                detail, extra={"request_id": request_id, "status": status, "client": client}
+            )
+            self.transport.write(_encode_problem(HTTPStatus(status), slug, detail, request_id))
         self._disconnect()
         self.transport.close()
 
@@ -152,17 +161,22 @@ def connection_class(patience_s: float) -> type[Connection]:
     return type("Connection", (Connection,), {"patience_s": patience_s})
 
 
-def _encode_problem(status: HTTPStatus, slug: str, detail: str) -> bytes:
+def _encode_problem(status: HTTPStatus, slug: str, detail: str, request_id: str) -> bytes:
     problem = {
         "type": PROBLEM_TYPE_PREFIX + slug,
         "title": status.phrase,
         "status": status.value,
         "detail": detail,
+        "request_id": request_id,
     }
     body = json.dumps(problem).encode()
     head = (
         f"HTTP/1.1 {status.value} {status.phrase}\r\n"
         "content-type: application/problem+json\r\n"
-        f"content-length: {len(body)}\r\nconnection: close\r\n\r\n"
+        f"content-length: {len(body)}\r\n"
+        f"x-request-id: {request_id}\r\n"
+        "server-timing: app;dur=0\r\n"
+        "x-content-type-options: nosniff\r\n"
+        "connection: close\r\n\r\n"
     )
     return head.encode() + body

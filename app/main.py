@@ -110,6 +110,8 @@ def create_app(
         middleware=middleware,
         docs_url=None,  # ours is in app.api.page: FastAPI's loads its scripts from elsewhere
         redoc_url=None,
+        # /v1/poses/ is a 404 that says so: a redirect loses the bodies of most clients.
+        redirect_slashes=False,
     )
     app.state.service = service
     problems.install(app)

@@ -157,18 +157,22 @@ class RequestContextMiddleware:
                 headers.setdefault("X-Content-Type-Options", "nosniff")
             await send(message)
 
+        # Whatever can be got can be asked about (RFC 9110, 9.1); the server leaves the body out.
+        inner = {**scope, "method": "GET"} if scope["method"] == "HEAD" else scope
         try:
-            await self._app(scope, receive, send_with_headers)
+            await self._app(inner, receive, send_with_headers)
         except Exception:
             logger.exception("unhandled error", extra={"request_id": request_id})
             if status:
                 raise  # the answer has begun; only closing the connection is left
             await _send_internal_error(request_id, send_with_headers)
         finally:
-            self._record(scope, status, time.perf_counter() - started_s, request_id)
+            route = state.get("route") or getattr(inner.get("route"), "path", "unmatched")
+            self._record(scope, route, status, time.perf_counter() - started_s, request_id)
 
-    def _record(self, scope: Scope, status: int, spent_s: float, request_id: str) -> None:
-        route = scope["state"].get("route") or getattr(scope.get("route"), "path", "unmatched")
+    def _record(
+        self, scope: Scope, route: str, status: int, spent_s: float, request_id: str
+    ) -> None:
         method = scope["method"] if scope["method"] in _METHODS else "other"
         self._metrics.requests.labels(route, method, str(status or 499)).inc()
         self._metrics.request_seconds.labels(route).observe(spent_s)

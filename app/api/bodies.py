@@ -158,12 +158,19 @@ def photo_bytes(body: bytes, content_type: str | None) -> bytes:
 
 
 def image_parts(body: bytes, content_type: str | None) -> list[Part]:
-    """The parts of field ``image``, in order; ``InvalidInputError`` when there is none."""
+    """The parts of field ``image``, in order.
+
+    ``InvalidInputError`` when there is none, or another field, which would be ignored.
+    """
     parts = parse_multipart(body, content_type)
     images = [part for part in parts if part.field == "image"]
     if not images:
-        others = ", ".join(sorted({part.field for part in parts})) or "no fields"
-        raise InvalidInputError([("image", f"the form has no field 'image', but {others}")])
+        given = ", ".join(sorted({part.field for part in parts})) or "no fields"
+        raise InvalidInputError([("image", f"the form has no field 'image', but {given}")])
+    others = sorted({part.field for part in parts} - {"image"})
+    if others:
+        why = "the form may have the field 'image' only; parameters go into the URL's query"
+        raise InvalidInputError([(field, why) for field in others])
     return images
 
 

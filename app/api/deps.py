@@ -12,7 +12,13 @@ from fastapi import Depends, Request
 from app.admission import Admission
 from app.api.bodies import UploadMemory
 from app.engine import Engine
-from app.errors import NotReadyError, QuotaExceededError, StartupError, UnauthorizedError
+from app.errors import (
+    InvalidInputError,
+    NotReadyError,
+    QuotaExceededError,
+    StartupError,
+    UnauthorizedError,
+)
 from app.observability import Metrics
 from app.quota import Quota
 from app.settings import Settings
@@ -81,6 +87,19 @@ async def authorise(request: Request, service: ServiceDep) -> None:
         if retry_after_s is not None:
             service.metrics.refused.labels("quota").inc()
             raise QuotaExceededError(retry_after_s)
+
+
+async def each_once(request: Request) -> None:
+    """No query parameter may be given twice: one of the two would be ignored."""
+    names = [name for name, _ in request.query_params.multi_items()]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InvalidInputError([(name, "is given more than once") for name in twice])
+
+
+async def no_query(request: Request) -> None:
+    """The request is all in the body: what is in the query would be ignored."""
+    if names := sorted(request.query_params):
+        raise InvalidInputError([(name, "belongs into the JSON body") for name in names])
 
 
 async def get_engine(service: ServiceDep) -> Engine:

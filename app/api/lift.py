@@ -11,13 +11,13 @@ from pydantic import ValidationError
 from app import schemas
 from app.answers import lift_answer, rounded_timings
 from app.api.bodies import WatchedArrival, read_body
-from app.api.deps import EngineDep, ServiceDep, authorise
+from app.api.deps import EngineDep, ServiceDep, authorise, no_query
 from app.api.problems import describe, describe_ok, invalid_input
 from app.errors import MalformedBodyError
 from app.pipeline import LiftQuery
 from library_store.conversion import CONVERSIONS
 
-router = APIRouter(tags=["lift"], dependencies=[Depends(authorise)])
+router = APIRouter(tags=["lift"], dependencies=[Depends(authorise), Depends(no_query)])
 
 MAX_LIFT_BODY_BYTES = 2_000_000
 """256 people of 14 joints, generously indented."""

@@ -21,7 +21,7 @@ from app.api.bodies import (
     photo_bytes,
     read_body,
 )
-from app.api.deps import EngineDep, Service, ServiceDep, authorise
+from app.api.deps import EngineDep, Service, ServiceDep, authorise, each_once
 from app.api.problems import describe, describe_ok, problem_of
 from app.engine import MAX_PEOPLE, Engine
 from app.errors import (
@@ -34,7 +34,7 @@ from app.errors import (
 from app.imaging import KNOWN_TYPES
 from app.pipeline import PhotoQuery
 
-router = APIRouter(tags=["poses"], dependencies=[Depends(authorise)])
+router = APIRouter(tags=["poses"], dependencies=[Depends(authorise), Depends(each_once)])
 
 
 class PoseParameters(schemas.Given):
@@ -42,7 +42,9 @@ class PoseParameters(schemas.Given):
 
     max_people: int = Field(5, ge=1, le=MAX_PEOPLE, description="Most people to answer.")
     candidates: schemas.Candidates = Field(
-        3, description="How many of the shortlist to return; never changes the answer."
+        3,
+        description="How many of the shortlist (30; 10 with `method=paper`) to return at most; "
+        "never changes the answer.",
     )
     method: schemas.Method = Field(
         "fusion", description="`paper` is the method of Chen & Ramanan (2017) to the letter."

@@ -24,6 +24,7 @@ _MAX_PIECES = 65_536
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _JPEG_NOT_FILL = re.compile(rb"[^\xff]")
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
+_TEXT = re.compile(rb"[\t-\r\x1b -~]+")
 _ISO_BRANDS = {
     b"hevc": "a HEIF sequence",
     b"mif1": "HEIF",
@@ -98,11 +99,9 @@ def _other_type(data: bytes) -> str | None:
         return "SVG"
     if head.startswith((b"<!doctype html", b"<html")):
         return "HTML"
-    try:
-        data[:512].decode("ascii")
-    except UnicodeDecodeError:
-        return None
-    return "text"
+    if data[4:8] == b"ftyp":
+        return "a video"
+    return "text" if _TEXT.fullmatch(data[:512]) else None
 
 
 def _corrupt(media_type: str, why: str) -> NoReturn:

@@ -36,7 +36,10 @@ def is_closed(connection: socket.socket, within_s: float = 20.0) -> bool:
 def check_problem(connection: socket.socket, status: int, slug: str) -> None:
     answered, body = read_response(connection)
     assert answered == status
-    assert json.loads(body)["type"] == f"urn:posematch:problem:{slug}"
+    problem = json.loads(body)
+    assert problem["type"] == f"urn:posematch:problem:{slug}"
+    assert problem["status"] == status
+    assert problem["request_id"]
     assert is_closed(connection)
 
 

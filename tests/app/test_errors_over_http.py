@@ -185,6 +185,23 @@ def test_unknown_and_wrong_verb(server: Server) -> None:
     response = server.client.get("/v1/poses")
     problem(response, 405, "method-not-allowed")
     assert response.headers["allow"] == "POST"
+    problem(post(server, b"x", "/v1/poses/"), 404, "not-found")
+
+
+@pytest.mark.parametrize("path", ["/livez", "/readyz", "/v1/info", "/metrics", "/"])
+def test_what_can_be_got_can_be_asked_about(server: Server, path: str) -> None:
+    response = server.client.head(path)
+    assert (response.status_code, response.content) == (200, b"")
+
+
+def test_what_would_be_ignored_is_refused(server: Server, photo: bytes) -> None:
+    form = {"image": ("a.jpg", photo)}
+    aside = server.client.post("/v1/poses", files=form, data={"max_people": "1"})
+    assert "query" in problem(aside, 422, "invalid-input")["detail"]
+    twice = post(server, photo, "/v1/poses?max_people=1&max_people=2")
+    assert "more than once" in problem(twice, 422, "invalid-input")["detail"]
+    lifted = post(server, b"{}", "/v1/lift?candidates=3")
+    assert problem(lifted, 422, "invalid-input")["errors"][0]["where"] == "candidates"
 
 
 def test_multipart_syntax(server: Server, photo: bytes) -> None:
