@@ -9,8 +9,12 @@ the rest of a body refused unread         read and dropped for ``patience_s``, t
 an answer that the client does not take   closed after ``patience_s``
 ========================================= ==================================================
 
-These errors arise before there is a request, so they are written here, as problem+json like all
-others and with a request id of their own, which the log has too.
+Under overload nearly all requests are refused, and what a refusal costs is taken from the answers:
+those that can be given from the request's head alone (``app.api.shedding``) are written from here,
+without a task and a walk through the application.
+
+The errors of the table arise before there is a request, so they are written here, as problem+json
+like all others and with a request id of their own, which the log has too.
 """
 
 from __future__ import annotations
@@ -22,14 +26,18 @@ import re
 import uuid
 from collections.abc import Callable
 from http import HTTPStatus
-from typing import ClassVar
+from typing import ClassVar, cast
 
+from starlette.types import Scope
 from uvicorn._types import ASGI3Application
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
 from app.errors import PROBLEM_TYPE_PREFIX
 
 logger = logging.getLogger("posematch.connection")
+
+EarlyAnswer = Callable[[Scope], bytes | None]
+"""The whole response to a request of which the head is read, if there is one already."""
 
 MAX_HEAD_BYTES = 65_536
 _UPGRADE = re.compile(rb"(?im)^Upgrade(?=[ \t]*:)")
@@ -41,6 +49,7 @@ class Connection(HttpToolsProtocol):
     """uvicorn's protocol with patience; make a class with ``connection_class``."""
 
     patience_s: ClassVar[float]
+    early_answer: ClassVar[EarlyAnswer]
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start waiting for the first head."""
@@ -142,6 +151,14 @@ class Connection(HttpToolsProtocol):
 
     def _start_asgi_task(self, cycle: RequestResponseCycle, app: ASGI3Application) -> None:
         self._running = cycle
+        # With others queued behind it one after the other would be answered from within the last.
+        if cycle.keep_alive and not self.pipeline and not self.flow.write_paused:
+            answer = type(self).early_answer(cast(Scope, cycle.scope))
+            if answer is not None:
+                self.transport.write(answer)
+                cycle.response_started = cycle.response_complete = True
+                cycle.on_response()
+                return
         super()._start_asgi_task(cycle, app)
 
     def _disconnect(self) -> None:
@@ -156,9 +173,10 @@ class Connection(HttpToolsProtocol):
                 cycle.message_event.set()
 
 
-def connection_class(patience_s: float) -> type[Connection]:
+def connection_class(patience_s: float, early_answer: EarlyAnswer) -> type[Connection]:
     """The class to give to uvicorn."""
-    return type("Connection", (Connection,), {"patience_s": patience_s})
+    members = {"patience_s": patience_s, "early_answer": staticmethod(early_answer)}
+    return type("Connection", (Connection,), members)
 
 
 def _encode_problem(status: HTTPStatus, slug: str, detail: str, request_id: str) -> bytes:

@@ -138,8 +138,7 @@ class RequestContextMiddleware:
             await self._app(scope, receive, send)
             return
         started_s = time.perf_counter()
-        given = Headers(scope=scope).get("x-request-id", "")
-        request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
+        request_id = request_id_of(scope)
         state = scope.setdefault("state", {})
         state["request_id"] = request_id
         timings_ms: dict[str, float] = {}
@@ -150,11 +149,8 @@ class RequestContextMiddleware:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
-                headers = MutableHeaders(scope=message)
-                headers["X-Request-ID"] = request_id
                 elapsed = {"app": 1e3 * (time.perf_counter() - started_s)}
-                headers["Server-Timing"] = server_timing(timings_ms | elapsed)
-                headers.setdefault("X-Content-Type-Options", "nosniff")
+                add_context(MutableHeaders(scope=message), request_id, timings_ms | elapsed)
             await send(message)
 
         # Whatever can be got can be asked about (RFC 9110, 9.1); the server leaves the body out.
@@ -168,14 +164,32 @@ class RequestContextMiddleware:
             await _send_internal_error(request_id, send_with_headers)
         finally:
             route = state.get("route") or getattr(inner.get("route"), "path", "unmatched")
-            self._record(scope, route, status, time.perf_counter() - started_s, request_id)
+            record_request(
+                self._metrics, scope, route, status, time.perf_counter() - started_s, request_id
+            )
 
-    def _record(
-        self, scope: Scope, route: str, status: int, spent_s: float, request_id: str
-    ) -> None:
-        method = scope["method"] if scope["method"] in _METHODS else "other"
-        self._metrics.requests.labels(route, method, str(status or 499)).inc()
-        self._metrics.request_seconds.labels(route).observe(spent_s)
+
+def request_id_of(scope: Scope) -> str:
+    """The id that the client gave its request, or a new one."""
+    given = Headers(scope=scope).get("x-request-id", "")
+    return given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
+
+
+def add_context(headers: MutableHeaders, request_id: str, timings_ms: Mapping[str, float]) -> None:
+    """What every response has: its request's id, where the time went, and no guessing of types."""
+    headers["X-Request-ID"] = request_id
+    headers["Server-Timing"] = server_timing(timings_ms)
+    headers.setdefault("X-Content-Type-Options", "nosniff")
+
+
+def record_request(
+    metrics: Metrics, scope: Scope, route: str, status: int, spent_s: float, request_id: str
+) -> None:
+    """Count an answered request and log it; ``status`` 0: its client left."""
+    method = scope["method"] if scope["method"] in _METHODS else "other"
+    metrics.requests.labels(route, method, str(status or 499)).inc()
+    metrics.request_seconds.labels(route).observe(spent_s)
+    if access_logger.isEnabledFor(logging.INFO):
         access_logger.info(
             "request",
             extra={

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 import uvicorn
 
+from app.api.shedding import EarlyRefusals
 from app.commands.console import build_if_missing
 from app.connection import connection_class
 from app.errors import StartupError
@@ -43,7 +44,9 @@ def serve(
             app,
             host=settings.host,
             port=settings.port,
-            http=connection_class(settings.upload_timeout_s),
+            http=connection_class(
+                settings.upload_timeout_s, EarlyRefusals(app.state.service).encoded
+            ),
             lifespan="on",
             ws="none",
             access_log=False,
