@@ -23,7 +23,6 @@ import asyncio
 import json
 import logging
 import re
-import uuid
 from collections.abc import Callable
 from http import HTTPStatus
 from typing import ClassVar, cast
@@ -33,6 +32,7 @@ from uvicorn._types import ASGI3Application
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
 from app.errors import PROBLEM_TYPE_PREFIX
+from app.observability import new_request_id
 
 logger = logging.getLogger("posematch.connection")
 
@@ -135,7 +135,7 @@ class Connection(HttpToolsProtocol):
         cycle = self.cycle
         begun = cycle is not None and cycle.response_started and not cycle.response_complete
         if not begun and not self.pipeline:
-            request_id = uuid.uuid4().hex
+            request_id = new_request_id()
             client = self.client[0] if self.client else None
             logger.info(
                 detail, extra={"request_id": request_id, "status": status, "client": client}
