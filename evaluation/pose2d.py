@@ -100,6 +100,16 @@ def blazepose(folder: Path, variant: str) -> Estimate:
     return estimate
 
 
+def networks(name: str, weights: Path | None, reference: Path) -> dict[str, Estimate]:
+    """Ours and those to compare with, by the name of their column."""
+    return {
+        "ours": ours(name, weights),
+        "mobile CPM": mobile_cpm(reference / "mobile_cpm.onnx"),
+        "BlazePose full": blazepose(reference, "full"),
+        "BlazePose heavy": blazepose(reference, "heavy"),
+    }
+
+
 def score(estimate: Estimate, crops: list[LabelledCrop], label: str) -> Score:
     """Run a network over a set."""
     predicted = []
@@ -161,12 +171,7 @@ def main() -> None:
     )
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    networks = {
-        "ours": ours(args.name, args.weights),
-        "mobile CPM": mobile_cpm(args.reference / "mobile_cpm.onnx"),
-        "BlazePose full": blazepose(args.reference, "full"),
-        "BlazePose heavy": blazepose(args.reference, "heavy"),
-    }
+    compared = networks(args.name, args.weights, args.reference)
     labelled = load(args.data / "lspet_val.tar")
     photos = [
         crop
@@ -175,11 +180,11 @@ def main() -> None:
         if held_out(crop)
     ][: args.photos]
     print(f"## lspet_val: {len(labelled)} people, human labels\n")
-    print(table({k: score(run, labelled, k) for k, run in networks.items()}))
+    print(table({k: score(run, labelled, k) for k, run in compared.items()}))
     # The heavy reference made these labels, on crops of the photos themselves turned upright: its
     # own column says how far it repeats itself on the stored crop, which bounds all the others.
     print(f"\n## held-out photos: {len(photos)} people, labels by BlazePose heavy\n")
-    print(table({k: score(run, photos, k) for k, run in networks.items()}))
+    print(table({k: score(run, photos, k) for k, run in compared.items()}))
 
 
 if __name__ == "__main__":

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from library_store.skeleton import L_HIP, L_SHOULDER, LSP14, R_HIP, R_SHOULDER
+from models.training.cutout import over, place, silhouette, whole
 from models.training.dataset import Image, LabelledCrop
 
 MIRROR = np.array(LSP14.mirror)
@@ -18,6 +19,8 @@ UPRIGHT_SHARE = 0.6
 """Of the views that are turned until the trunk stands upright: what the second look at a person
 gets. The others teach the first look, which meets people as they are."""
 UPRIGHT_SPREAD_DEG = 15.0
+COMPANY_SHARE = 0.25
+"""Of the views that get a second person, close by, before or behind the one they are about."""
 TORSO = [R_SHOULDER, L_SHOULDER, R_HIP, L_HIP]
 
 
@@ -96,6 +99,8 @@ def random_view(
     crop: LabelledCrop, other: LabelledCrop, size: int, rng: np.random.Generator
 ) -> Sample:
     """A random crop, turn, mirror image, occlusion and exposure; ``other`` lends the occluder."""
+    if rng.random() < COMPANY_SHARE and whole(other):
+        crop = in_company(crop, other, rng)
     center, extent = crop.extent_px
     scale = CROP_SCALE * float(np.exp(rng.uniform(np.log(0.85), np.log(1.4))))
     offset = rng.normal(0, 0.05, 2)
@@ -114,6 +119,34 @@ def random_view(
         for _ in range(rng.integers(1, 3)):
             _occlude(image, sample.joints_px, presence, other.image, rng)
     return Sample(expose(image, rng), sample.joints_px, sample.weight, presence)
+
+
+def in_company(crop: LabelledCrop, other: LabelledCrop, rng: np.random.Generator) -> LabelledCrop:
+    """``crop`` with ``other`` beside the person: cut out, of about the same size, overlapping.
+
+    Joints that the other one covers keep their place, at half the trust, and are no longer seen.
+    """
+    center, extent = crop.extent_px
+    other_center, other_extent = other.extent_px
+    scale = extent / other_extent * float(np.exp(rng.normal(0, 0.15)))
+    flip = bool(rng.random() < 0.5)
+    reach = 0.5 * (np.ptp(crop.joints_px, axis=0) + scale * np.ptp(other.joints_px, axis=0))
+    way = rng.normal(0, 0.35 if not crop.wild else 1.0) + (np.pi if rng.random() < 0.5 else 0)
+    aside = rng.uniform(0.35, 0.9) * reach * np.array([np.cos(way), np.sin(way)])
+    shift = (center + aside - other_center * scale * (-1 if flip else 1, 1)).astype(np.float64)
+    size = (crop.image.shape[1], crop.image.shape[0])
+    placed, _ = place(other.image, size, scale, shift, flip, np.zeros(3))
+    mask, _ = place(silhouette(other), size, scale, shift, flip, np.zeros(3))
+    if rng.random() < 0.5 and whole(crop):
+        mask = mask * (1 - silhouette(crop))
+    x, y = np.clip(np.rint(crop.joints_px).astype(int), 0, np.array(size) - 1).T
+    covered = mask[y, x] > 0.5
+    return replace(
+        crop,
+        image=over(crop.image, placed, mask),
+        weight=np.where(covered, 0.5 * crop.weight, crop.weight),
+        visible=np.where(covered, 0, crop.visible),
+    )
 
 
 def _random_turn(crop: LabelledCrop, rng: np.random.Generator) -> float:

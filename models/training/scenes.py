@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.training.augment import expose
+from models.training.cutout import place
 from models.training.dataset import Image, LabelledCrop
 
 SURE, UNSURE = 0.6, 0.3
@@ -33,21 +34,6 @@ class SceneSample:
     image: Image
     boxes: NDArray[np.float32]
     trust: NDArray[np.float32]
-
-
-def place(
-    image: Image,
-    size: tuple[int, int],
-    scale: float,
-    shift: NDArray[np.float64],
-    flip: bool,
-    fill: NDArray[np.float64],
-) -> tuple[Image, NDArray[np.float32]]:
-    """An image on a canvas of ``size`` (w, h), and the (2, 3) affine that put it there."""
-    matrix = np.array([[-scale if flip else scale, 0, shift[0]], [0, scale, shift[1]]])
-    flags = cv2.INTER_AREA if scale < 0.6 else cv2.INTER_LINEAR
-    placed = cv2.warpAffine(image, matrix, size, flags=flags, borderValue=tuple(fill))
-    return placed, matrix.astype(np.float32)
 
 
 def moved(boxes: NDArray[np.float32], matrix: NDArray[np.float32]) -> NDArray[np.float32]:

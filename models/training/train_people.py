@@ -18,7 +18,8 @@ from torch.nn import functional as F
 
 from models.person_detector import decode, iou
 from models.training import loop
-from models.training.crowds import calm_patches, crowd, whole
+from models.training.crowds import calm_patches, crowd
+from models.training.cutout import whole
 from models.training.dataset import decode_members
 from models.training.network import PersonConfig, PersonNetwork
 from models.training.scenes import UNSURE, LabelledScene, SceneSample, mosaic, portrait, scene_view

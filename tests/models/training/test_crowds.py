@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from library_store.skeleton import LSP14
-from models.training.crowds import Member, calm_patches, crowd, silhouette, whole
+from models.training.crowds import Member, calm_patches, crowd
+from models.training.cutout import silhouette, whole
 from models.training.dataset import LabelledCrop
 from models.training.scenes import LabelledScene
 
