@@ -28,8 +28,10 @@ class Evidence:
         total = np.maximum(values, 0.0) + noise_var[:, None]
         self._inverse = 1.0 / total
         self._rotated = innovation @ self._vectors
-        self._log_evidence = -0.5 * (np.log(total) + self._rotated**2 * self._inverse).sum(1)
-        share = np.exp(self._log_evidence - self._log_evidence.max())
+        log_evidence = -0.5 * (np.log(total) + self._rotated**2 * self._inverse).sum(1)
+        log_evidence -= log_evidence.max()
+        share = np.exp(log_evidence)
+        self._log_share = log_evidence - np.log(share.sum())
         share /= share.sum()
         self.mean_noise_var = float(share @ noise_var)
         self.mean_precision: Floats = (self._vectors * (share @ self._inverse)) @ self._vectors.T
@@ -50,22 +52,14 @@ class Evidence:
         residual_x = (c * p - b * q) / determinant
         residual_y = (a * q - b * p) / determinant
         left_out = residual_x * p + residual_y * q
-        without = self._log_evidence[:, None] + 0.5 * (left_out - np.log(determinant))
         # What the joint's own position would have cost as an outlier: a broad Gaussian about the
         # prediction by the others.
-        elsewhere = -0.5 * (residual_x**2 + residual_y**2) / OUTLIER_SIGMA_PX**2
-        elsewhere = elsewhere - np.log(OUTLIER_SIGMA_PX**2)
-        wrong = np.clip(1.0 - confidence, outlier_prior, 1.0 - outlier_prior)
-        odds = (
-            _log_sum(without + elsewhere, axis=0)
-            - _log_sum(self._log_evidence, axis=0)
-            + np.log(wrong / (1.0 - wrong))
-        )
+        elsewhere = (residual_x**2 + residual_y**2) * OUTLIER_SIGMA_PX**-2
+        # Relative to the evidence of all joints, whose levels' shares sum to 1.
+        without = 0.5 * (left_out - elsewhere - np.log(determinant)) + self._log_share[:, None]
+        top = without.max(axis=0)
+        wrong = np.minimum(np.maximum(1.0 - confidence, outlier_prior), 1.0 - outlier_prior)
+        odds = np.log(np.exp(without - top).sum(axis=0)) + top
+        odds += np.log(wrong / (1.0 - wrong)) - np.log(OUTLIER_SIGMA_PX**2)
         worst = int(np.argmax(odds))
         return worst if odds[worst] > 0 else None
-
-
-def _log_sum(values: Floats, axis: int) -> Floats:
-    top = values.max(axis=axis, keepdims=True)
-    total: Floats = np.log(np.exp(values - top).sum(axis=axis)) + np.squeeze(top, axis=axis)
-    return total

@@ -11,6 +11,7 @@ there, and the answer turned back. Both steps are exact: a rotation about the ca
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,7 +57,7 @@ def lift_to_depth(points: Floats, depths_mm: Floats) -> Floats:
 
 def rotation_onto_axis(direction: Floats) -> Floats:
     """Smallest rotation that turns ``direction`` (3,) with z > 0 onto +z; returns (3, 3)."""
-    x, y, z = direction / np.linalg.norm(direction)
+    x, y, z = (direction / math.sqrt(direction @ direction)).tolist()
     # Rodrigues' formula for the axis d × e_z; 1 + cos > 1, so there is no degenerate case.
     scale = 1.0 / (1.0 + z)
     return np.array(
@@ -107,10 +108,11 @@ def centre_view(
 
     """
     present = weights > 0
-    flat = np.where(present[:, None], (joints_px - principal_point_px) / focal_length_px, 0.0)
-    rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
-    units = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    rotation = rotation_onto_axis(weights @ units)
+    rays = np.ones((len(weights), 3))
+    flat = (joints_px - principal_point_px) / focal_length_px
+    rays[:, :2] = np.where(present[:, None], flat, 0.0)
+    # Each counts as the unit vector along it.
+    rotation = rotation_onto_axis((weights / np.sqrt((rays**2).sum(1))) @ rays)
     turned = rays @ rotation.T
     # A joint more than 90° from the person's own centre cannot be seen: it would be behind.
     depth = np.maximum(turned[:, 2:], 1e-3)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.lifting.geometry import Floats, Integers
+from app.lifting.geometry import Floats
 from library_store.anatomy import LENGTHS
 from library_store.proportions import BONES, ROOT
 from library_store.skeleton import LSP14
@@ -82,8 +82,11 @@ def _paired_segments() -> tuple[tuple[Segment, Segment], ...]:
 
 
 SYMMETRIC_SEGMENTS = _paired_segments()
-_STARTS: Integers = np.array([[a, b] for (a, _), (b, _) in SYMMETRIC_SEGMENTS])
-_ENDS: Integers = np.array([[a, b] for (_, a), (_, b) in SYMMETRIC_SEGMENTS])
+_STARTS, _ENDS = np.moveaxis(np.array(SYMMETRIC_SEGMENTS), 2, 0)
+_INCIDENCE: Floats = np.eye(LSP14.n_joints)[_ENDS] - np.eye(LSP14.n_joints)[_STARTS]
+"""(5, 2, J): times joints, the segments."""
+_SIGNED_INCIDENCE = np.swapaxes(_INCIDENCE, 1, 2) * np.array([1.0, -1.0])
+"""(5, J, 2): from the segments back to their joints, the left ones subtracted."""
 
 
 def asymmetry(joints_mm: Floats) -> tuple[Floats, Floats]:
@@ -91,12 +94,7 @@ def asymmetry(joints_mm: Floats) -> tuple[Floats, Floats]:
 
     Returns (5,) and (5, J, 3) a mm.
     """
-    segment = joints_mm[_ENDS] - joints_mm[_STARTS]
-    squared = np.maximum((segment**2).sum(-1), 1.0)
-    ratio = 0.5 * np.log(squared[:, 0] / squared[:, 1])
-    slope = segment / squared[..., None] * np.array([1.0, -1.0])[:, None]
-    derivative = np.zeros((len(segment), *joints_mm.shape))
-    rows = np.arange(len(segment))[:, None]
-    np.add.at(derivative, (rows, _ENDS), slope)
-    np.add.at(derivative, (rows, _STARTS), -slope)
-    return ratio, derivative
+    segment = _INCIDENCE @ joints_mm
+    squared = np.maximum((segment**2).sum(-1, keepdims=True), 1.0)
+    logs = 0.5 * np.log(squared[..., 0])
+    return logs[:, 0] - logs[:, 1], _SIGNED_INCIDENCE @ (segment / squared)
