@@ -59,18 +59,19 @@ def pair(behind: LabelledCrop, front: LabelledCrop, rng: np.random.Generator) ->
     shift = (target - own_centre * scale).astype(np.float64)
     placed, matrix = place(front.image, size, scale, shift, False, np.zeros(3))
     mask, _ = place(silhouette(front), size, scale, shift, False, np.zeros(3))
-    shown = over(image, placed, mask)
+    both = over(image, placed, mask)
     front_px = front.joints_px @ matrix[:, :2].T + matrix[:, 2]
 
     def uncovered(joints_px: NDArray[np.float32], cover: NDArray[np.float32]) -> NDArray[np.bool_]:
         at = np.rint(joints_px).astype(int)
         x, y = np.clip(at, 0, np.array(size) - 1).T
-        inside: NDArray[np.bool_] = ((at >= 0) & (at < size)).all(1)
-        return np.logical_and(inside, cover[y, x] < COVERED)
+        shown: NDArray[np.bool_] = np.all((at >= 0) & (at < size), axis=1)
+        shown &= cover[y, x] < COVERED
+        return shown
 
     people = (
-        replace(behind, image=shown, joints_px=behind_px),
-        replace(front, image=shown, joints_px=front_px.astype(np.float32)),
+        replace(behind, image=both, joints_px=behind_px),
+        replace(front, image=both, joints_px=front_px.astype(np.float32)),
     )
     seen = [uncovered(behind_px, mask), uncovered(people[1].joints_px, np.zeros_like(mask))]
     return Pair(people, np.stack(seen))
