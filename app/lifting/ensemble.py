@@ -73,19 +73,22 @@ def place_ensemble(
             0 for none.
 
     """
-    rotated = exemplars_mm @ np.swapaxes(rotations, 1, 2)
+    # Coordinates before joints: that is how small products are fast.
+    rotated = rotations @ np.swapaxes(exemplars_mm, 1, 2).copy()
     typical = rotated[:_TYPICAL].mean(0)
-    shaped = typical + proportion_spread * proportion_directions(typical)
+    directions = proportion_directions(typical.T)
+    shaped = typical + proportion_spread * np.swapaxes(directions, 1, 2)
     posed = np.concatenate([rotated, typical[None], shaped])
-    placed = posed + initial_translation(posed, points, weights)[:, None]
-    root_depth = 0.5 * (placed[:, R_HIP, 2] + placed[:, L_HIP, 2])
-    n = len(rotated)
+    placed = posed + initial_translation(posed, points, weights)[..., None]
+    depth = placed[:, 2]
+    root_depth = 0.5 * (depth[:, R_HIP] + depth[:, L_HIP])
+    n, n_joints = len(rotated), len(points)
     px_per_unit = STANDARD_PX_PER_MM * float(np.sort(root_depth[:n])[n // 2])
-    depth = placed[..., 2]
-    image = px_per_unit * placed[..., :2] / depth[..., None]
-    states = np.concatenate(
-        [image.reshape(len(posed), -1), depth / root_depth[:, None] - 1.0], axis=1
-    )
+    scale = px_per_unit / depth
+    states = np.empty((len(posed), 3 * n_joints))
+    np.multiply(placed[:, 0], scale, out=states[:, 0 : 2 * n_joints : 2])
+    np.multiply(placed[:, 1], scale, out=states[:, 1 : 2 * n_joints : 2])
+    np.subtract(depth / root_depth[:, None], 1.0, out=states[:, 2 * n_joints :])
     return Ensemble(
         states=states[:n],
         root_depth_mm=root_depth[:n],
@@ -118,13 +121,13 @@ def local_prior(
 
     """
     residual = ensemble.states[:, rows] - observed[rows]
-    squared = (residual**2).sum(1)
+    squared = np.einsum("kr,kr->k", residual, residual)
     if len(ensemble.proportions):
         # Woodbury: the distance in the metric of bandwidth² I + Gᵀ G.
         explained = ensemble.proportions[:, rows] / bandwidth_px
         inner = np.eye(len(explained)) + explained @ explained.T
         reach = residual @ explained.T
-        squared -= ((reach @ np.linalg.inv(inner)) * reach).sum(1)
+        squared -= np.einsum("kd,kd->k", reach @ np.linalg.inv(inner), reach)
     # Per coordinate; two coordinates a joint less the translation and scale already fitted.
     nearest = squared.min() / max(len(rows) - 4, 1)
     variance = bandwidth_px**2 + adaptive * nearest

@@ -43,7 +43,7 @@ def initial_translation(rotated_mm: Floats, targets: Floats, weights: Floats) ->
     perspective. Weighted normal equations, solved in closed form.
 
     Args:
-        rotated_mm: (..., J, 3) ``R @ X``, about the root.
+        rotated_mm: (..., 3, J) ``R @ X``, about the root.
         targets: (..., J, 2) normalised image coordinates.
         weights: (..., J), not all 0.
 
@@ -51,11 +51,6 @@ def initial_translation(rotated_mm: Floats, targets: Floats, weights: Floats) ->
         (..., 3) mm, in front of the camera also when the joints say nothing about depth.
 
     """
-    return _initial_translation(np.swapaxes(rotated_mm, -1, -2), targets, weights)
-
-
-def _initial_translation(rotated_mm: Floats, targets: Floats, weights: Floats) -> Floats:
-    """:func:`initial_translation` of points (..., 3, J)."""
     share = weights / weights.sum(-1, keepdims=True)
     moment = share[..., None] * targets
     mean_target = moment.sum(-2)
@@ -112,7 +107,7 @@ def resect(
     if targets.ndim > 2 or weights.ndim > 1:
         targets = np.broadcast_to(targets, (*lead, joints, 2)).reshape(-1, joints, 2)
         weights = np.broadcast_to(weights, (*lead, joints)).reshape(-1, joints)
-    translation = _initial_translation(rotated, targets, weights)
+    translation = initial_translation(rotated, targets, weights)
     observed = np.swapaxes(targets, -1, -2)
     weight = base_weight = weights[..., None, :]
     damping = np.full(len(points), _INITIAL_DAMPING)

@@ -72,7 +72,7 @@ def test_agrees_with_opencv_on_noisy_cases(poses: Floats) -> None:
     targets = see(poses, rotations, translations) + RNG.normal(size=(len(poses), 14, 2)) * 0.005
     start = nudge(rotations, 0.1)
     found = resect(poses, start, targets, np.ones(14), iterations=20)
-    rotated = poses @ np.swapaxes(start, 1, 2)
+    rotated = start @ np.swapaxes(poses, 1, 2)
     first = initial_translation(rotated, targets, np.ones(14))
     theirs = []
     # OpenCV stops early unless lengths are near 1 and pixels are pixels: metres, and the real f.
