@@ -12,7 +12,7 @@ COPY requirements.lock ./
 ENV HNSWLIB_NO_NATIVE=1
 RUN /opt/posematch/bin/python -m pip install --no-cache-dir --disable-pip-version-check \
     --require-hashes --requirement requirements.lock
-COPY pyproject.toml README.md LICENSE ./
+COPY pyproject.toml hatch_build.py README.md LICENSE ./
 COPY library_store library_store
 COPY models models
 COPY evaluation evaluation

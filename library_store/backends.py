@@ -110,7 +110,7 @@ def open_index(
     assert descriptors is not None
     if backend == "exact":
         return ExactIndex(descriptors)
-    cells = CellIndex.load(directory, len(descriptors))
+    cells = CellIndex.load(directory, descriptors)
     if backend == "hnsw":
         return HnswIndex.load(directory / HNSW_FILE, descriptors, cells)
     return cells

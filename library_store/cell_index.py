@@ -1,10 +1,10 @@
-"""The default index: k-means cells, of which the nearest are scanned.
+"""The index for every mask: k-means cells, of which the nearest are scanned.
 
 One structure serves complete queries and every mask:
 
 1. The cells are ranked by the (masked) similarity of their centres.
-2. All entries of the nearest cells are ranked by their similarity in float32.
-3. The best of them are put in exact order in float64.
+2. All rows of the nearest cells are ranked by their similarity (:mod:`library_store.scan`).
+3. The best of them are put in exact order, by their descriptors in float64.
 
 The more of the person is missing, the more cells are nearly equal and the more are scanned.
 """
@@ -13,39 +13,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from library_store.cells import Cells, partition
-from library_store.descriptor import DIMENSIONS, Float, normalise
+from library_store.descriptor import DIMENSIONS, N_JOINTS, Float, normalise
 from library_store.errors import LibraryError
-from library_store.masked import Correlation, missing_limbs, nearest_masked
-from library_store.neighbours import (
-    SPARE,
-    Descriptors,
-    Entries,
-    Neighbours,
-    Similarity,
-    largest,
-    nearest_of,
-    product_with,
-    stack,
-)
+from library_store.masked import missing_limbs, nearest_masked
+from library_store.neighbours import Descriptors, Entries, Neighbours, nearest_of, stack
+from library_store.scan import LANES, Scan, encode, n_blocks
 from library_store.tables import TableWriter, open_table
 
-CELLS_FILE, ROWS_FILE, ENTRIES_FILE = "index.cells.npz", "index.rows.npy", "index.entries.npy"
+CELLS_FILE, CODES_FILE, ENTRIES_FILE = "index.cells.npz", "index.codes.npy", "index.entries.npy"
 ROWS_PER_CELL = 100
 """Entries in a cell on average: fewer make ranking the cells, more scanning them slower."""
 
-CELL_FILES = (CELLS_FILE, ROWS_FILE, ENTRIES_FILE)
+CELL_FILES = (CELLS_FILE, CODES_FILE, ENTRIES_FILE)
 
-_YES = np.ones(1, dtype=np.bool_)
-_SCAN_BLOCK = 4_096  # rows that stay in the second-level cache
-_WRITE_BLOCK = 65_536
+_RANKED, _RANKED_PER_NEIGHBOUR = 30, 2
+"""Rows put in exact order, and more for each neighbour: the scan sees them rounded."""
+_EQUAL = np.full(N_JOINTS, 1.0 / N_JOINTS)
+_WRITE_BLOCK = 4_096 * LANES
 
 
 @dataclass(frozen=True)
@@ -76,17 +66,20 @@ class ScanSettings:
 
 
 class CellIndex:
-    """Scans the nearest cells of a partition of the library."""
+    """Scans the nearest cells of a partition of the library's descriptors (E, 28)."""
 
     backend = "cells"
 
-    def __init__(self, cells: Cells, rows: Descriptors, settings: ScanSettings) -> None:
-        self._cells = cells
-        self._rows = rows
+    def __init__(
+        self, cells: Cells, scan: Scan, descriptors: Descriptors, settings: ScanSettings
+    ) -> None:
+        self._entries = cells.entries
+        self._scan = scan
+        self._descriptors = descriptors
         self._settings = settings
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self._descriptors)
 
     @classmethod
     def build(
@@ -97,68 +90,55 @@ class CellIndex:
     ) -> CellIndex:
         """The index in memory, of descriptors (E, 28)."""
         cells = partition(descriptors, rows_per_cell)
-        return cls(cells, descriptors[cells.entries], settings or ScanSettings())
+        scan = Scan(encode(descriptors[cells.entries]), cells.starts, cells.centres)
+        return cls(cells, scan, descriptors, settings or ScanSettings())
 
     @classmethod
-    def load(cls, directory: Path, n: int, settings: ScanSettings | None = None) -> CellIndex:
-        """Open what :func:`write_cells` wrote, memory-mapped; ``LibraryError`` if not of n rows."""
+    def load(
+        cls, directory: Path, descriptors: Descriptors, settings: ScanSettings | None = None
+    ) -> CellIndex:
+        """Open what :func:`write_cells` wrote, memory-mapped; ``LibraryError`` if of other rows."""
         entries = open_table(directory / ENTRIES_FILE).astype(np.int32, copy=False)
-        rows = open_table(directory / ROWS_FILE).astype(np.float32, copy=False)
+        codes = open_table(directory / CODES_FILE).astype(np.int8, copy=False)
+        if entries.shape != (len(descriptors),):
+            raise LibraryError(
+                f"{directory / ENTRIES_FILE} does not hold {len(descriptors)} exemplars"
+            )
         cells = Cells.load(directory / CELLS_FILE, entries)
-        if rows.shape != (n, DIMENSIONS) or entries.shape != (n,):
-            raise LibraryError(f"{directory / ROWS_FILE} does not hold {n} exemplars")
-        return cls(cells, rows, settings or ScanSettings())
+        scan = Scan(codes, cells.starts, cells.centres)
+        return cls(cells, scan, descriptors, settings or ScanSettings())
 
     def query(self, descriptors: Descriptors, k: int) -> Neighbours:
         """The ``min(k, len)`` nearest entries of each descriptor (Q, 28)."""
         k = min(k, len(self))
-        n_rows = self._settings.n_scanned(len(self), None, k)
+        n_scanned = self._settings.n_scanned(len(self), None, k)
         found = []
         for descriptor in np.asarray(descriptors, dtype=np.float32):
-            rows = self._scan(product_with(descriptor), n_rows, k)
-            found.append(nearest_of(self._rows[rows], self._entries(rows), descriptor, k))
+            entries = self._near(descriptor.reshape(N_JOINTS, 2), _EQUAL, n_scanned, k)
+            found.append(nearest_of(self._descriptors[entries], entries, descriptor, k))
         return stack(found, k)
 
     def query_masked(self, points: Float, weights: Float, k: int) -> Neighbours:
         """The same for 2D poses (Q, 14, 2) with weights (Q, 14), by the masked distance."""
         k = min(k, len(self))
         found = []
-        for query, share in zip(normalise(points, weights), weights, strict=True):
-            n_rows = self._settings.n_scanned(len(self), share, k)
-            rows = self._scan(Correlation(query, share), n_rows, k)
-            entries = self._entries(rows)
-            found.append(nearest_masked(self._rows[rows], entries, query, share, k))
+        for query, given in zip(normalise(points, weights), weights, strict=True):
+            n_scanned = self._settings.n_scanned(len(self), given, k)
+            entries = self._near(query, given / given.sum(), n_scanned, k)
+            found.append(nearest_masked(self._descriptors[entries], entries, query, given, k))
         return stack(found, k)
 
     def close(self) -> None:
         """Let go of the maps."""
-        self._rows = np.zeros((0, DIMENSIONS), dtype=np.float32)
-        self._cells = partition(self._rows, 1)
+        self._descriptors = np.zeros((0, DIMENSIONS), dtype=np.float32)
+        self._scan = Scan(encode(self._descriptors), np.zeros(1, np.int64), self._descriptors)
+        self._entries = np.zeros(0, dtype=np.int32)
 
-    def _entries(self, rows: Entries) -> Entries:
-        return self._cells.entries[rows].astype(np.int64)
-
-    def _scan(self, similarity: Similarity, n_rows: int, k: int) -> Entries:
-        """The rows most similar among those of the nearest cells: k and a few more, unordered."""
-        near = self._cells.near(similarity, max(n_rows, k + SPARE))
-        starts, stops = self._cells.starts[near], self._cells.starts[near + 1]
-        # Cells that lie side by side are read in one piece.
-        apart = starts[1:] != stops[:-1]
-        starts = starts[np.concatenate([_YES, apart])]
-        stops = stops[np.concatenate([apart, _YES])]
-        ends = np.cumsum(stops - starts)
-        runs = [self._rows[a:b] for a, b in zip(starts.tolist(), stops.tolist(), strict=True)]
-        # A few runs at a time, so that they are still in the cache when they are ranked.
-        blocks = np.searchsorted(ends, np.arange(0, ends[-1], _SCAN_BLOCK)).tolist()
-        values = [
-            similarity(np.concatenate(runs[first:after]))
-            for first, after in pairwise([*blocks, len(runs)])
-            if first < after
-        ]
-        best = largest(np.concatenate(values), k + SPARE)
-        run_of = np.searchsorted(ends, best, side="right")
-        rows: NDArray[np.int64] = best - ends[run_of] + stops[run_of]
-        return rows
+    def _near(self, query: Float, share: Float, n_scanned: int, k: int) -> Entries:
+        """The entries of the rows most similar to a query, more than k, in no order."""
+        ranked = min(_RANKED + _RANKED_PER_NEIGHBOUR * k, len(self))
+        rows = self._scan.nearest(query, share, max(n_scanned, ranked), ranked)
+        return self._entries[rows].astype(np.int64)
 
 
 def write_cells(
@@ -172,8 +152,9 @@ def write_cells(
     cells = partition(descriptors, rows_per_cell, lambda done: report(0.9 * done))
     cells.save(directory / CELLS_FILE)
     np.save(directory / ENTRIES_FILE, cells.entries, allow_pickle=False)
-    with TableWriter(directory / ROWS_FILE, descriptors.shape, np.float32) as table:
+    shape = (n_blocks(len(descriptors)), DIMENSIONS, LANES)
+    with TableWriter(directory / CODES_FILE, shape, np.int8) as table:
         for start in range(0, len(descriptors), _WRITE_BLOCK):
-            table.append(descriptors[cells.entries[start : start + _WRITE_BLOCK]])
+            table.append(encode(descriptors[cells.entries[start : start + _WRITE_BLOCK]]))
     report(1.0)
     return {"cells": len(cells.centres), "rows_per_cell": rows_per_cell}

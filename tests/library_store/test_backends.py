@@ -75,8 +75,8 @@ def test_a_library_of_another_version_is_to_be_built_again(
     settings = BuildSettings(name="older", n_poses=50)
     build_library(tmp_path / "older", prior, settings)
     path = tmp_path / "older" / MANIFEST
-    path.write_text(path.read_text().replace('"format": 3', '"format": 2'))
-    with pytest.raises(LibraryError, match=r"another version.*format 2.*posematch library build"):
+    path.write_text(path.read_text().replace('"format": 4', '"format": 3'))
+    with pytest.raises(LibraryError, match=r"another version.*format 3.*posematch library build"):
         load(tmp_path / "older")
     build_library(tmp_path / "older", prior, settings)
     load(tmp_path / "older").close()

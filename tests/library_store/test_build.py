@@ -24,7 +24,7 @@ from library_store.build import (
     ensure_default_library,
     verify_library,
 )
-from library_store.cell_index import CELL_FILES, ROWS_FILE
+from library_store.cell_index import CELL_FILES, ENTRIES_FILE
 from library_store.errors import LibraryError
 from library_store.library import Library, load
 from library_store.manifest import CONTENT_FILES, MANIFEST
@@ -87,7 +87,7 @@ def test_the_digest_is_of_the_content_not_of_the_index(
     settings = replace(TINY, index=IndexSettings(rows_per_cell=20))
     other = build_library(tmp_path / "other", prior, settings)
     same = describe_library(tiny)
-    assert other.files[ROWS_FILE] != same.files[ROWS_FILE]
+    assert other.files[ENTRIES_FILE] != same.files[ENTRIES_FILE]
     assert other.sha256 == same.sha256
     reseeded = build_library(tmp_path / "other", prior, replace(TINY, seed=1))
     assert reseeded.sha256 != same.sha256

@@ -20,15 +20,12 @@ def table() -> np.ndarray:
     return table
 
 
-def test_every_row_is_in_one_cell_and_every_cell_in_one_group(table: np.ndarray) -> None:
+def test_every_row_is_in_one_cell(table: np.ndarray) -> None:
     cells = partition(table, 50)
     assert_array_equal(np.sort(cells.entries), np.arange(len(table)))
     assert cells.sizes.sum() == len(table)
     assert len(cells.centres) == len(cells.sizes)
     assert 50 <= len(cells.sizes) <= 200
-    assert cells.group_starts[0] == 0
-    assert cells.group_starts[-1] == len(cells.centres)
-    assert len(cells.group_starts) == len(cells.group_centres) + 1
 
 
 def test_cells_hold_near_rows(table: np.ndarray) -> None:
@@ -40,32 +37,7 @@ def test_cells_hold_near_rows(table: np.ndarray) -> None:
 
 def test_centres_are_as_long_as_rows(table: np.ndarray) -> None:
     cells = partition(table, 50)
-    for centres in (cells.centres, cells.group_centres):
-        np.testing.assert_allclose(np.linalg.norm(centres, axis=1), np.sqrt(14.0), rtol=1e-5)
-
-
-@pytest.mark.parametrize("n_rows", [1, 100, 1_000, 5_000, 10_000])
-def test_the_nearest_cells_hold_as_many_rows_as_wanted(n_rows: int, table: np.ndarray) -> None:
-    cells = partition(table, 50)
-    near = cells.near(lambda rows: rows @ table[17], n_rows)
-    assert np.all(np.diff(near) > 0)
-    held = cells.sizes[near].sum()
-    assert held >= min(n_rows, len(table))
-    assert held - cells.sizes.max() < n_rows
-
-
-def test_few_groups_are_looked_into_for_few_rows(table: np.ndarray) -> None:
-    cells = partition(table, 50)
-    seen: list[int] = []
-
-    def similarity(rows: np.ndarray) -> np.ndarray:
-        seen.append(len(rows))
-        similar: np.ndarray = rows @ table[17]
-        return similar
-
-    cells.near(similarity, 20)
-    assert seen[0] == len(cells.group_centres)
-    assert seen[1] < len(cells.centres) / 2
+    np.testing.assert_allclose(np.linalg.norm(cells.centres, axis=1), np.sqrt(14.0), rtol=1e-5)
 
 
 def test_the_same_table_gives_the_same_cells(table: np.ndarray) -> None:

@@ -43,7 +43,7 @@ def directory(table: np.ndarray, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 @pytest.fixture(scope="module")
 def cells(directory: Path, table: np.ndarray) -> CellIndex:
-    return CellIndex.load(directory, len(table), SCAN)
+    return CellIndex.load(directory, table, SCAN)
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +162,7 @@ def test_files_of_another_table_are_refused(
     directory: Path, table: np.ndarray, cells: CellIndex, tmp_path: Path
 ) -> None:
     with pytest.raises(LibraryError, match="10 exemplars"):
-        CellIndex.load(directory, 10)
+        CellIndex.load(directory, table[:10])
     with pytest.raises(LibraryError, match=r"index\.hnsw indexes 4000 exemplars instead of 10"):
         HnswIndex.load(directory / HNSW_FILE, table[:10], cells)
     cut = tmp_path / HNSW_FILE

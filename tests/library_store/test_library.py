@@ -126,7 +126,7 @@ def test_the_manifest_says_what_the_library_is(small: Library, prior: PosePrior)
     assert manifest.build["seed"] == 7
     assert manifest.build["prior"]["sha256"] == prior.sha256
     assert manifest.licences[0].credit.startswith("The data used in this project")
-    assert json.loads(manifest.to_json())["format"] == 3
+    assert json.loads(manifest.to_json())["format"] == 4
 
 
 def test_the_exact_index_can_be_asked_for(small: Library, small_directory: Path) -> None:

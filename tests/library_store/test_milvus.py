@@ -30,7 +30,7 @@ EXAMPLE = Path(__file__).parents[2] / "app" / "examples" / "lift_request.json"
 NOT_NEEDED = (
     "descriptors.npy",
     "index.cells.npz",
-    "index.rows.npy",
+    "index.codes.npy",
     "index.entries.npy",
 )
 

@@ -1,0 +1,32 @@
+"""Compiles library_store/scan.cpp when the project is installed, in place or into a wheel."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from hatchling.builders.hooks.plugin.interface import BuildHookInterface
+
+SOURCE, COMPILED = "library_store/scan.cpp", "library_store/_scan.so"
+FLAGS = ["-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC"]
+
+
+class CompileScan(BuildHookInterface):  # type: ignore[type-arg]
+    """The one part of the project that is not Python."""
+
+    def initialize(self, version: str, build_data: dict[str, Any]) -> None:  # noqa: ARG002
+        """Compile, and say that the wheel holds for this platform."""
+        compiler = os.environ.get("CXX") or shutil.which("c++") or shutil.which("g++")
+        if compiler is None:
+            raise SystemExit("a C++ compiler is needed (Debian: apt-get install g++)")
+        root = Path(self.root)
+        # In one step, for the file may be in use.
+        unfinished = root / f"{COMPILED}.{os.getpid()}"
+        subprocess.run([compiler, *FLAGS, "-o", unfinished, root / SOURCE], check=True)
+        unfinished.replace(root / COMPILED)
+        build_data["artifacts"].append(COMPILED)
+        build_data["pure_python"] = False
+        build_data["infer_tag"] = True
