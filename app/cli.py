@@ -46,6 +46,14 @@ def main() -> None:
     except (LibraryError, ModelError) as error:
         notices.print(f"[red]error:[/red] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(1)
+    except (FileNotFoundError, PermissionError, NotADirectoryError, IsADirectoryError) as error:
+        # Of a path that the user gave: what the service itself needs has errors of its own.
+        notices.print(
+            f"[red]error:[/red] {escape(str(error.filename))}: {error.strerror}",
+            highlight=False,
+            soft_wrap=True,
+        )
+        sys.exit(1)
     except PoseMatchError as error:
         notices.print(
             f"[red]cannot start:[/red] {escape(str(error))}", highlight=False, soft_wrap=True

@@ -157,8 +157,8 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--own-boxes", action="store_true", help="detect, instead of the true box")
     args = parser.parse_args()
-    pipeline = load_engine(load_settings()).pipeline
     renders = read_renders(args.data)
+    pipeline = load_engine(load_settings()).pipeline
 
     print("| image | people | PCK@0.2, 12 limb joints | PA mm, 12 | root-relative mm, 14 |")
     print("|---|---|---|---|---|")

@@ -118,7 +118,12 @@ def read_manifest(directory: Path) -> Manifest:
             f"{path} is missing: there is no pose library in {directory}; "
             "build one with `posematch library build`"
         ) from None
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise LibraryError(
+            f"{path} cannot be read ({error.strerror}): is {directory} the directory of a library, "
+            "and may this user read it?"
+        ) from error
+    except ValueError as error:
         raise LibraryError(f"{path} cannot be read ({error}); {mend}") from error
     try:
         written = content.pop("format")

@@ -145,6 +145,19 @@ def test_evaluate_lists_and_runs_programs() -> None:
     assert "lifting" in unknown.stderr
 
 
+def test_paths_that_are_not_there_or_no_directories(tmp_path: Path) -> None:
+    absent = run("evaluate", "renders", "--data", tmp_path / "none")
+    assert absent.returncode == 1
+    assert absent.stderr.strip().startswith("error: ")
+    assert absent.stderr.strip().endswith("No such file or directory")
+    file = tmp_path / "file"
+    file.touch()
+    wrong = run("library", "info", file)
+    assert wrong.returncode == 1
+    assert "is that the directory of a library" in wrong.stderr.replace(str(file), "that")
+    assert "delete" not in wrong.stderr
+
+
 def test_library_import(tmp_path: Path) -> None:
     (tmp_path / "02_01.bvh").write_text(cmu_bvh(walk()))
     (tmp_path / "bad.bvh").write_text("HIERARCHY")
