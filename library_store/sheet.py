@@ -71,12 +71,17 @@ def draw_pose(tile: Image, pose_mm: Float) -> None:
     nearness = (depths.max() - depths) / max(float(np.ptp(depths)), 1.0)
     for a, b in order:
         thickness = 2 + round(2.0 * float(nearness[[a, b]].mean()))
-        start, end = (_fixed(points[joint]) for joint in (a, b))
-        cv2.line(tile, start, end, _colour(b), thickness, cv2.LINE_AA, _SUBPIXEL_BITS)
+        draw_bone(tile, points[a], points[b], b, thickness)
     radius = 0.35 * float(np.linalg.norm(points[HEAD_TOP] - points[NECK]))
     middle = _fixed(0.35 * points[NECK] + 0.65 * points[HEAD_TOP])
     size = round(radius * (1 << _SUBPIXEL_BITS))
     cv2.circle(tile, middle, size, _MIDDLE, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def draw_bone(tile: Image, start_px: Float, end_px: Float, joint: int, thickness: int) -> None:
+    """The bone that ends at ``joint``, in the colour of its side."""
+    ends = (_fixed(start_px), _fixed(end_px))
+    cv2.line(tile, *ends, _colour(joint), thickness, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
 def _caption(tile: Image, library: Library, entry: int) -> None:
