@@ -99,7 +99,7 @@ def networks_of(engine: Engine) -> tuple[schemas.Network, ...]:
             gflop=round(network.card.gflop, 3),
             input_px=network.card.output.side_px,
         )
-        for network in (engine.estimator, engine.detector)
+        for network in engine.networks
     )
 
 

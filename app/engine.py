@@ -13,14 +13,14 @@ import numpy as np
 from app.errors import LibraryUnavailableError, StartupError
 from app.lifting.lifter import Lifter, LiftingSettings
 from app.pipeline import PhotoQuery, Pipeline
-from app.settings import Settings
+from app.settings import LIFTER_OFF, Settings
 from library_store.build import ensure_default_library
 from library_store.errors import LibraryError
 from library_store.library import Library
 from library_store.library import load as load_library
 from library_store.manifest import read_manifest
 from library_store.milvus import MilvusSettings
-from models import ModelCard, ModelError, PersonDetector, PoseEstimator
+from models import ModelCard, ModelError, PersonDetector, PoseEstimator, PoseLifter
 from models.choice import choose
 
 Progress = Callable[[str, float], None]
@@ -32,14 +32,24 @@ _WARM_UP_RUNS = 3
 
 @dataclass(frozen=True)
 class Engine:
-    """What is served; ``photo_s`` is about how long a small photo of one person takes."""
+    """What is served; ``photo_s`` is about how long a small photo of one person takes.
+
+    ``lifter`` is the network that lifts beside the library, None if the settings want none.
+    """
 
     library: Library
     card: ModelCard
     detector: PersonDetector
     estimator: PoseEstimator
+    lifter: PoseLifter | None
     pipeline: Pipeline
     photo_s: float
+
+    @property
+    def networks(self) -> tuple[PoseEstimator | PersonDetector | PoseLifter, ...]:
+        """All networks in service."""
+        served = (self.estimator, self.detector)
+        return served if self.lifter is None else (*served, self.lifter)
 
 
 def locate_library(settings: Settings, progress: Progress | None = None) -> Path:
@@ -69,6 +79,16 @@ def chosen_networks(settings: Settings) -> tuple[str, str]:
     return pose, choose(where, "people", provider=provider)
 
 
+def load_lifter(settings: Settings) -> PoseLifter | None:
+    """The lifting network of the settings, None for off. Raises ``ModelError``."""
+    if settings.lifter == LIFTER_OFF:
+        return None
+    try:
+        return PoseLifter(settings.lifter, weights_dir=settings.weights_dir)
+    except ModelError as error:
+        raise ModelError(f"{error} (POSEMATCH_LIFTER={LIFTER_OFF} serves without it)") from error
+
+
 def load_engine(settings: Settings) -> Engine:
     """Load and warm up; blocking, a second or so.
 
@@ -85,13 +105,15 @@ def load_engine(settings: Settings) -> Engine:
         detector = PersonDetector(
             people, weights_dir=where, provider=provider, concurrency=side_by_side
         )
+        lifter = load_lifter(settings)
         estimator.warm_up(MAX_PEOPLE)
         detector.warm_up()
     except ModelError as error:
         raise StartupError(str(error)) from error
     library = _open_library(locate_library(settings), settings)
-    pipeline = _assemble(detector, estimator, library, settings)
-    return Engine(library, estimator.card, detector, estimator, pipeline, _warm_up(pipeline))
+    pipeline = _assemble(detector, estimator, lifter, library, settings)
+    photo_s = _warm_up(pipeline)
+    return Engine(library, estimator.card, detector, estimator, lifter, pipeline, photo_s)
 
 
 def reload_engine(engine: Engine, settings: Settings) -> Engine | None:
@@ -107,7 +129,7 @@ def reload_engine(engine: Engine, settings: Settings) -> Engine | None:
     except LibraryError as error:
         raise StartupError(str(error)) from error
     library = _open_library(directory, settings)
-    pipeline = _assemble(engine.detector, engine.estimator, library, settings)
+    pipeline = _assemble(engine.detector, engine.estimator, engine.lifter, library, settings)
     _warm_up(pipeline)
     return replace(engine, library=library, pipeline=pipeline)
 
@@ -132,12 +154,16 @@ def milvus_of(settings: Settings) -> MilvusSettings | None:
 
 
 def _assemble(
-    detector: PersonDetector, estimator: PoseEstimator, library: Library, settings: Settings
+    detector: PersonDetector,
+    estimator: PoseEstimator,
+    lifter: PoseLifter | None,
+    library: Library,
+    settings: Settings,
 ) -> Pipeline:
     return Pipeline(
         detector,
         estimator,
-        Lifter(library, LiftingSettings(shortlist=settings.shortlist)),
+        Lifter(library, LiftingSettings(shortlist=settings.shortlist), lifter),
         max_pixels=settings.max_pixels,
         decode_side_px=settings.decode_side_px,
     )

@@ -94,7 +94,7 @@ def describe(service: Service, engine: Engine) -> None:
         model=f"{engine.card.name} {engine.card.version}",
         library=f"{manifest.name} {manifest.version}",
     )
-    for network in (engine.estimator, engine.detector):
+    for network in engine.networks:
         service.metrics.describe_network(
             network.card.output.kind,
             name=network.card.name,

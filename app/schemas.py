@@ -62,7 +62,7 @@ class Model(Answer):
 class Network(Answer):
     """A network in service: what it is, and what runs it in which precision."""
 
-    kind: Literal["pose", "people"]
+    kind: Literal["pose", "people", "lift"]
     name: str
     version: str
     sha256: str
@@ -70,7 +70,7 @@ class Network(Answer):
     precision: Literal["fp32", "bf16", "int8"]
     parameters: int
     gflop: float
-    input_px: int
+    input_px: int | None = Field(description="longer side of what it sees; null: no picture")
 
 
 class LibraryRef(Answer):

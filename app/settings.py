@@ -16,6 +16,8 @@ from library_store.backends import Backend
 from models import ProviderChoice
 
 ENV_PREFIX = "POSEMATCH_"
+LIFTER_OFF = "off"
+"""``Settings.lifter`` of a service that lifts by matching alone."""
 
 
 def default_cache_dir() -> Path:
@@ -142,6 +144,12 @@ class Settings(BaseSettings):
         12.0,
         gt=0,
         description="CPU time a person that POSEMATCH_MODEL=auto may spend, as the cards have it.",
+    )
+    lifter: str = Field(
+        "lifter",
+        min_length=1,
+        description="Name of the lifting network's card, whose answer the fusion takes in beside "
+        "the exemplars; off for matching alone.",
     )
     provider: ProviderChoice = Field(
         "auto",

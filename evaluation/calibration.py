@@ -22,9 +22,11 @@ from app.lifting.calibration import SigmaCalibration
 from app.lifting.lifter import Lifter, LiftingSettings
 from evaluation.lifting import Lifted, lift_all
 from evaluation.metrics import Floats, rigid_error_mm, root_centred_error_mm
+from evaluation.networks import SHIPPED, add_network_option, network_of
 from evaluation.protocols import LiftingSet, clean, load_lifting_set
 from library_store.library import Library, load
 from library_store.skeleton import LSP14
+from models.pose_lifter import PoseLifter
 
 COVERAGE = 0.68
 LIBRARY_SIGMAS_PX = (10.0, 15.0, 20.0, 30.0, 40.0, 55.0, 80.0)
@@ -33,6 +35,24 @@ PROBABILITY_EDGES = (0.0, 0.02, 0.04, 0.06, 0.08, 0.12, 1.0)
 NOISE_MM_PER_PX = (0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0, 30.0)
 LEVEL_TOLERANCE = 0.045
 """How far the coverage of one noise level may be off, on the people fitted on."""
+
+
+@dataclass(frozen=True)
+class Served:
+    """A library and the network beside it, if any."""
+
+    library: Library
+    network: PoseLifter | None
+
+    @classmethod
+    def of(cls, directory: Path, card: str) -> Served:
+        """Load them."""
+        library = load(directory)
+        return cls(library, network_of(card, library))
+
+    def lifter(self, settings: LiftingSettings) -> Lifter:
+        """A lifter of both."""
+        return Lifter(self.library, settings, self.network)
 
 
 @dataclass(frozen=True)
@@ -80,12 +100,12 @@ def coverage(calibration: SigmaCalibration, errors: Errors) -> float:
     return float((errors.error_mm <= calibration(errors.spread_mm, errors.noise_px)).mean())
 
 
-def collect_errors(library: Library, data: LiftingSet, settings: LiftingSettings) -> list[Errors]:
+def collect_errors(served: Served, data: LiftingSet, settings: LiftingSettings) -> list[Errors]:
     """Spread and error of the fused answer at every noise level."""
     raw = replace(settings, sigma=SigmaCalibration((1.0,) * LSP14.n_joints, 0.0))
     collected = []
     for points in data.joints_2d_px.values():
-        lifted = lift_all(Lifter(library, raw), clean(points), data.intrinsics, "fusion")
+        lifted = lift_all(served.lifter(raw), clean(points), data.intrinsics, "fusion")
         assert lifted.sigma_mm is not None
         error = root_centred_error_mm(lifted.joints_mm, data.joints_3d_mm)
         noise = [person.noise_px for person in lifted.people if person.noise_px is not None]
@@ -127,10 +147,10 @@ def report_probability(label: str, lifted: Lifted, truth: Floats) -> None:
 
 
 def mean_log_score(
-    library: Library, data: LiftingSet, settings: LiftingSettings, *, stated: bool
+    served: Served, data: LiftingSet, settings: LiftingSettings, *, stated: bool
 ) -> Floats:
     """Mean of :func:`log_score` over people, by noise level."""
-    lifter = Lifter(library, settings)
+    lifter = served.lifter(settings)
     means = []
     for noise, points in data.joints_2d_px.items():
         sigma = max(float(noise), STATED_FLOOR_PX) if stated else None
@@ -173,30 +193,32 @@ def main(arguments: Sequence[str] | None = None) -> None:
         metavar=("LIBRARY", "DATA"),
         action="append",
         default=[],
-        help="another library and set to check on",
+        help="another library, with the shipped network, and set to check on",
     )
     parser.add_argument("--search", action="store_true", help="try other values of eq. 4's sigma")
     parser.add_argument("--people", type=int, default=None, help="only the first N of each set")
+    add_network_option(parser)
     chosen = parser.parse_args(arguments)
-    library, settings = load(chosen.library), LiftingSettings()
+    served, settings = Served.of(chosen.library, chosen.network), LiftingSettings()
     data = load_lifting_set(chosen.data).first(chosen.people)
 
-    halves = [errors.split() for errors in collect_errors(library, data, settings)]
+    halves = [errors.split() for errors in collect_errors(served, data, settings)]
     calibration = fit_sigma([half[0] for half in halves])
     print(calibration)
     report_coverage("fitted half", calibration, [half[0] for half in halves])
     report_coverage("other half", calibration, [half[1] for half in halves])
-    _check_probability(library, data.half(1), settings)
+    _check_probability(served, data.half(1), settings)
     for directory, path in chosen.check:
-        other, elsewhere = load(directory), load_lifting_set(path).first(chosen.people)
+        other = Served.of(directory, SHIPPED)
+        elsewhere = load_lifting_set(path).first(chosen.people)
         report_coverage(elsewhere.name, calibration, collect_errors(other, elsewhere, settings))
         _check_probability(other, elsewhere, settings)
     if chosen.search:
-        _search(library, data, settings)
+        _search(served, data, settings)
 
 
-def _check_probability(library: Library, data: LiftingSet, settings: LiftingSettings) -> None:
-    lifter = Lifter(library, settings)
+def _check_probability(served: Served, data: LiftingSet, settings: LiftingSettings) -> None:
+    lifter = served.lifter(settings)
     for noise, points in data.joints_2d_px.items():
         observations = list(clean(points).observations())
         answers = lifter.lift(observations, data.intrinsics, n_candidates=settings.shortlist)
@@ -204,13 +226,13 @@ def _check_probability(library: Library, data: LiftingSet, settings: LiftingSett
         report_probability(f"{data.name}, {noise} px", lifted, data.joints_3d_mm)
 
 
-def _search(library: Library, data: LiftingSet, settings: LiftingSettings) -> None:
+def _search(served: Served, data: LiftingSet, settings: LiftingSettings) -> None:
     fit, check = data.half(0), data.half(1)
     for stated in (True, False):
         print("2D noise stated:" if stated else "2D noise unknown:")
         for sigma in LIBRARY_SIGMAS_PX:
             one = replace(settings, sigma_library_px=sigma, sigma_2d_px=0.0)
-            scores = [mean_log_score(library, half, one, stated=stated) for half in (fit, check)]
+            scores = [mean_log_score(served, half, one, stated=stated) for half in (fit, check)]
             by_noise = " ".join(f"{score:.3f}" for score in scores[0])
             print(
                 f"  sigma {sigma:g}: log P of the nearest candidate {scores[0].mean():.3f} "

@@ -18,6 +18,7 @@ import numpy as np
 from app.lifting.lifter import Lifter
 from app.lifting.types import Intrinsics, LiftedPerson, Method, NotLiftable
 from evaluation.metrics import Floats, Summary, root_centred_error_mm, summarise
+from evaluation.networks import add_network_option, network_of
 from evaluation.protocols import SPOILERS, LiftingSet, Spoilt, load_lifting_set
 from library_store.library import load
 
@@ -120,9 +121,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         action="store_true",
         help="tell the lifter the 2D noise as a covariance, as the 2D network does",
     )
+    add_network_option(parser)
     chosen = parser.parse_args(arguments)
     library = load(chosen.library)
-    lifter = Lifter(library)
+    lifter = Lifter(library, network=network_of(chosen.network, library))
     print(f"library {library.manifest.name} {library.manifest.version}, {len(library)} exemplars")
     for path in chosen.data:
         data = load_lifting_set(path).first(chosen.people)

@@ -32,6 +32,7 @@ from evaluation.metrics import (
     root_centred_error_mm,
     similarity_error_mm,
 )
+from evaluation.networks import add_network_option, network_of
 from evaluation.protocols import LiftingSet, clean, load_lifting_set, one_corrupted, one_missing
 from library_store.library import load
 from library_store.skeleton import L_HIP, LSP14, NECK, R_HIP
@@ -221,8 +222,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--data", type=Path, action="append", required=True, help=".npz, repeatable"
     )
     parser.add_argument("--people", type=int, default=None, help="only the first N of each set")
+    add_network_option(parser)
     chosen = parser.parse_args(arguments)
-    lifter = Lifter(load(chosen.library))
+    library = load(chosen.library)
+    lifter = Lifter(library, network=network_of(chosen.network, library))
     for path in chosen.data:
         data = load_lifting_set(path).first(chosen.people)
         print(f"\n## {data.name}: {len(data.joints_3d_mm)} people")

@@ -1,7 +1,7 @@
 """p(x | I): from a photo to people's boxes and 2D joints.
 
-Two networks run by onnxruntime, each with a JSON model card beside its weights: a person detector
-on the whole photo and a Convolutional Pose Machine on each person's crop.
+Networks run by onnxruntime, each with a JSON model card beside its weights: a person detector on
+the whole photo, a Convolutional Pose Machine on each person's crop, and a lifter on their joints.
 """
 
 import os
@@ -15,6 +15,7 @@ from models.errors import ModelError
 from models.heatmaps import Joints2D
 from models.person_detector import PersonBox, PersonDetector
 from models.pose_estimator import PoseEstimator
+from models.pose_lifter import PoseLifter
 from models.providers import ProviderChoice, Runtime
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "PersonBox",
     "PersonDetector",
     "PoseEstimator",
+    "PoseLifter",
     "ProviderChoice",
     "Runtime",
 ]

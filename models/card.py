@@ -70,6 +70,18 @@ class DetectorOutput(_Frozen):
         return self.long_side_px
 
 
+class LiftOutput(_Frozen):
+    """A network that lifts joints to 3D, by itself, in units of what it is given."""
+
+    kind: Literal["lift"]
+    joint_names: list[str]
+
+    @property
+    def side_px(self) -> None:
+        """It sees no picture."""
+        return None
+
+
 Provider = Literal["cuda", "openvino", "cpu"]
 Precision = Literal["fp32", "bf16", "int8"]
 
@@ -100,7 +112,7 @@ class ModelCard(_Frozen):
         default_factory=dict,
         description="CPU-ms an input, one thread, by 'provider/precision'; posematch model check",
     )
-    output: Annotated[PoseOutput | DetectorOutput, Field(discriminator="kind")]
+    output: Annotated[PoseOutput | DetectorOutput | LiftOutput, Field(discriminator="kind")]
     training_data: list[str]
     licence: str
     limits: list[str]

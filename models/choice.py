@@ -23,11 +23,16 @@ class Candidate:
     cost_ms: float
 
 
-def cards_of(directory: Path, kind: Literal["pose", "people"]) -> list[ModelCard]:
-    """All cards of one kind, by name. Raises ``ModelError`` for a bad card or no card at all."""
+def cards_of(
+    directory: Path, kind: Literal["pose", "people", "lift"], *, needed: bool = True
+) -> list[ModelCard]:
+    """All cards of one kind, by name.
+
+    Raises ``ModelError`` for a bad card or, if one is ``needed``, no card at all.
+    """
     cards = [read_card(path) for path in sorted(directory.glob("*.json"))]
     found = [card for card in cards if card.output.kind == kind]
-    if not found:
+    if needed and not found:
         raise ModelError(
             f"no model card of kind {kind!r} in {directory}; restore models/weights from the "
             "repository or point POSEMATCH_WEIGHTS_DIR at a directory that has one"

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import logging
 import re
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from models.card import ModelCard, PoseOutput, read_card, read_weights
+from models.card import DetectorOutput, ModelCard, PoseOutput, read_card, read_weights
 from models.errors import ModelError
 from models.providers import (
     ProviderChoice,
@@ -77,47 +79,95 @@ class OnnxModel:
                 break
         self._check()
 
-    def run(self, images: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """(N, H, W, 3) uint8 BGR -> the network's maps (N, C, h, w) float32."""
-        maps: NDArray[np.float32] = self._session.run(None, {self._input: images})[0]
-        return maps
+    def run(self, batch: NDArray[Any]) -> NDArray[np.float32]:
+        """What the network makes of a batch, float32.
+
+        Of (N, H, W, 3) uint8 BGR its maps (N, C, h, w); of joints (N, 14, 3), see
+        ``models.pose_lifter``, their answer (N, rows, columns).
+        """
+        answer: NDArray[np.float32] = self._session.run(None, {self._input: batch})[0]
+        return answer
 
     def _check(self) -> None:
         """The network takes and gives what its card says, in batches; ``ModelError`` if not."""
+        probe = _probe(self.card)
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
-        if len(inputs) != 1 or len(outputs) != 1 or inputs[0].type != "tensor(uint8)":
+        if len(inputs) != 1 or len(outputs) != 1 or inputs[0].type != probe.kind:
             raise self._error(
-                "another kind of network: expected one uint8 image input (N, H, W, 3) and one "
+                f"another kind of network: expected {probe.wanted} and one "
                 f"output, found {[f'{i.name} {i.type} {i.shape}' for i in inputs]} and "
                 f"{[o.name for o in outputs]}"
             )
         self._input = inputs[0].name
-        if len(inputs[0].shape) != 4 or isinstance(inputs[0].shape[0], int):
-            raise self._error(f"fixed to inputs {inputs[0].shape}: the batch size must be free")
-        output = self.card.output
+        shape = inputs[0].shape
+        if len(shape) != probe.batch.ndim or isinstance(shape[0], int):
+            raise self._error(f"fixed to inputs {shape}: the batch size must be free")
+        try:
+            answer = self.run(probe.batch)
+        except Exception as error:
+            raise self._error(
+                f"at odds with their card: {probe.given}, as the card has "
+                f"it, are refused ({_said(error)})"
+            ) from error
+        if answer.shape != (2, *probe.answer):
+            raise self._error(
+                f"at odds with their card: maps of shape {answer.shape[1:]} instead of "
+                f"{probe.answer} ({probe.meaning})"
+            )
+        if not np.isfinite(answer).all():
+            raise self._error(f"damaged: the {probe.of_nothing} are not finite")
+
+    def _error(self, what: str) -> ModelError:
+        return ModelError(f"model weights {self._path} are {what}; {MEND}")
+
+
+@dataclass(frozen=True)
+class _Probe:
+    """Two inputs for a network of some card, the shape of an answer, and words for refusals."""
+
+    batch: NDArray[Any]
+    kind: str
+    answer: tuple[int, ...]
+    wanted: str
+    given: str
+    meaning: str
+    of_nothing: str
+
+
+def _probe(card: ModelCard) -> _Probe:
+    output = card.output
+    if isinstance(output, PoseOutput | DetectorOutput):
         if isinstance(output, PoseOutput):
             height = width = output.input_px
             channels = len(output.joint_names) + 1
         else:
             (height, width), channels = PROBE_PX, 5
-        size = (int(height / output.stride_px), int(width / output.stride_px))
-        try:
-            maps = self.run(np.zeros((2, height, width, 3), np.uint8))
-        except Exception as error:
-            raise self._error(
-                f"at odds with their card: two images of {width}x{height} px, as the card has "
-                f"it, are refused ({_said(error)})"
-            ) from error
-        if maps.shape != (2, channels, *size):
-            raise self._error(
-                f"at odds with their card: maps of shape {maps.shape[1:]} instead of "
-                f"{(channels, *size)} (joints and background or box, input over stride_px)"
-            )
-        if not np.isfinite(maps).all():
-            raise self._error("damaged: the maps of a black image are not finite")
+        return _Probe(
+            batch=np.zeros((2, height, width, 3), np.uint8),
+            kind="tensor(uint8)",
+            answer=(channels, int(height / output.stride_px), int(width / output.stride_px)),
+            wanted="one uint8 image input (N, H, W, 3)",
+            given=f"two images of {width}x{height} px",
+            meaning="joints and background or box, input over stride_px",
+            of_nothing="maps of a black image",
+        )
+    joints = len(output.joint_names)
+    return _Probe(
+        batch=made_up_joints(2, joints),
+        kind="tensor(float)",
+        answer=(1 + 3 * joints, 3 * joints),
+        wanted="one float input of joints (N, J, 3)",
+        given=f"two people of {joints} joints",
+        meaning="a state and the covariance of its errors",
+        of_nothing="answer for made-up joints",
+    )
 
-    def _error(self, what: str) -> ModelError:
-        return ModelError(f"model weights {self._path} are {what}; {MEND}")
+
+def made_up_joints(n: int, joints: int) -> NDArray[np.float32]:
+    """(n, joints, 3) such as a lifting network takes: anywhere, all of them present."""
+    batch = np.random.default_rng(0).random((n, joints, 3), np.float32)
+    batch[..., 2] = 1.0
+    return batch
 
 
 def runtimes(card: ModelCard, wanted: ProviderChoice = "auto") -> list[Runtime]:

@@ -29,7 +29,7 @@ from app.commands.machine import cpu_flags, describe_cpu, memory
 from app.engine import chosen_networks, load_engine
 from app.errors import StartupError
 from app.pipeline import PhotoQuery
-from app.settings import Settings, load_settings
+from app.settings import LIFTER_OFF, Settings, load_settings
 from library_store.build import default_library_dir, verify_library
 from library_store.errors import LibraryError
 from models.card import read_card, read_weights
@@ -237,10 +237,12 @@ def _exposure(settings: Settings) -> Finding:
 
 def _networks(settings: Settings) -> Iterator[Finding]:
     try:
-        names = chosen_networks(settings)
+        names: tuple[str, ...] = chosen_networks(settings)
     except ModelError as error:
         yield Finding("networks", "failure", *_split(str(error)))
         return
+    if settings.lifter != LIFTER_OFF:
+        names = (*names, settings.lifter)
     for name in names:
         yield _weights(settings.weights_dir, name)
 

@@ -52,7 +52,7 @@ def print_card(
         else:
             output.print(_card_table(card))
         return
-    chosen = chosen_networks(settings)
+    chosen = (*chosen_networks(settings), settings.lifter)
     cards = _all_cards(settings)
     if as_json:
         output.print_json(json.dumps([card.model_dump(mode="json") for card in cards]))
@@ -92,13 +92,14 @@ def check(
     for heading in ("network", "runs on", "input", "CPU-ms an input", "as its card has it"):
         table.add_column(heading)
     for card in _all_cards(settings) if name is None else [_card(settings, name)]:
-        model = OnnxModel(settings.weights_dir, card.name, provider=wanted)
+        runs_on = "cpu" if card.output.kind == "lift" else wanted
+        model = OnnxModel(settings.weights_dir, card.name, provider=runs_on)
         spent_ms = round(cpu_ms(model), 2)
         stated = card.cost_ms.get(str(model.runtime))
         table.add_row(
             f"{escape(card.name)} {escape(card.version)}",
             str(model.runtime),
-            f"{card.output.side_px} px",
+            _input(card),
             f"{spent_ms:.2f}",
             "-" if stated is None else f"{stated:.2f}",
         )
@@ -248,10 +249,10 @@ def import_caffe(
 
 
 def _complete(directory: Path, source: Path) -> None:
-    """Copy the person networks beside a new pose network, so that the directory can be served."""
+    """Copy the other networks beside a new pose network, so that the directory can be served."""
     if directory.resolve() == source.resolve():
         return
-    for card in cards_of(source, "people"):
+    for card in [*cards_of(source, "people"), *cards_of(source, "lift", needed=False)]:
         for file in (card.file, f"{card.name}.json"):
             if not (directory / file).exists():
                 shutil.copy(source / file, directory / file)
@@ -273,7 +274,13 @@ def _card(settings: Settings, name: str) -> ModelCard:
 
 def _all_cards(settings: Settings) -> list[ModelCard]:
     where = settings.weights_dir
-    return [*cards_of(where, "pose"), *cards_of(where, "people")]
+    lifters = cards_of(where, "lift", needed=False)
+    return [*cards_of(where, "pose"), *cards_of(where, "people"), *lifters]
+
+
+def _input(card: ModelCard) -> str:
+    side_px = card.output.side_px
+    return "2D joints" if side_px is None else f"{side_px} px"
 
 
 def _costs(cost_ms: dict[str, float]) -> str:
@@ -289,7 +296,7 @@ def _card_table(card: ModelCard) -> Table:
         "precision": card.precision,
         "providers": ", ".join(card.providers),
         "CPU features": ", ".join(card.cpu_features) or "any",
-        "input": f"{card.output.side_px} px",
+        "input": _input(card),
         "cost": f"{card.gflop:.2f} GFLOP, {card.multiply_adds / 1e9:.2f} GMAC, "
         f"{card.parameters:,} parameters",
         "CPU-ms an input": _costs(card.cost_ms),

@@ -5,11 +5,11 @@ in the 2D joints, is the radius that held 68% of the root-relative errors of peo
 not fitted on; ``evaluation.calibration`` refits it.
 
 What the constants here rest on: 750 people of five mocap subjects, all joints seen, at 0, 5 and 10
-px of noise together, lifted with a library fitted without these subjects. On 750 other people *of
-the same five subjects* the radius covers 72%, 67% and 66% at the three noise levels. It knows
-nothing of body size, which a photo does not show, and covers less of people of another build
-(docs/accuracy.md). A given subject height scales the radius with the answer but has not been
-calibrated for.
+px of noise together, lifted with a library and a lifting network fitted without these subjects. On
+750 other people *of the same five subjects* the radius covers 71%, 66% and 67% at the three noise
+levels. It knows nothing of body size, which a photo does not show, and covers less of people of
+another build (docs/accuracy.md). Without the network (``POSEMATCH_LIFTER=off``) it was not
+calibrated; nor for a given subject height, which scales the radius with the answer.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class SigmaCalibration:
 
 FUSION_SIGMA = SigmaCalibration(
     factors=(
-        0.998, 1.061, 1.015, 1.303, 1.274, 0.991, 1.162,
-        1.216, 0.636, 1.028, 1.071, 0.637, 1.002, 1.048,
+        1.150, 1.188, 1.129, 1.456, 1.428, 1.145, 1.260,
+        1.357, 0.630, 1.174, 1.242, 0.633, 1.112, 1.240,
     ),
     noise_mm_per_px=6.0,
 )  # fmt: skip

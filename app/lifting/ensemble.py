@@ -22,6 +22,7 @@ from app.lifting.geometry import Floats, Integers
 from app.lifting.posterior import STANDARD_PX_PER_MM
 from app.lifting.proportions import proportion_directions
 from app.lifting.resection import initial_translation
+from app.lifting.stature import stature_mm
 from library_store.skeleton import L_HIP, LSP14, R_HIP, Skeleton
 
 _TYPICAL = 16
@@ -34,13 +35,14 @@ class Ensemble:
 
     ``states`` (K, 3 J), see the module; ``root_depth_mm`` (K,); ``proportions`` (D, 3 J): what a
     typical deviation of the body's proportions adds to a state, one independent direction a row;
-    ``px_per_unit``: standard pixels in a normalised unit.
+    ``px_per_unit``: standard pixels in a normalised unit; ``stature_mm``: how tall they are.
     """
 
     states: Floats
     root_depth_mm: Floats
     proportions: Floats
     px_per_unit: float
+    stature_mm: float
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,7 @@ def place_ensemble(
         root_depth_mm=root_depth[:n],
         proportions=states[n + 1 :] - states[n],
         px_per_unit=px_per_unit,
+        stature_mm=float(stature_mm(exemplars_mm).mean()),
     )
 
 

@@ -14,13 +14,14 @@ posterior covariance tells how sure the depths are.
 
 The noise is estimated: R = what the 2D network said + ν² I (``app.lifting.evidence``).
 
-A second observation follows that holds for everybody: the right side of a body is as long as the
-left. It often tells which way a foreshortened limb points.
+A learned lifter's answer, if there is one, is observed next (``app.lifting.learned``). A last
+observation holds for everybody: the right side of a body is as long as the left. It often tells
+which way a foreshortened limb points. The whole is then made as tall as the neighbours are.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -28,9 +29,12 @@ import numpy as np
 from app.lifting.ensemble import Ensemble, LocalPrior, local_prior
 from app.lifting.evidence import Evidence
 from app.lifting.geometry import Floats, lift_to_depth
+from app.lifting.learned import with_learned
 from app.lifting.posterior import STANDARD_PX_PER_MM
 from app.lifting.proportions import asymmetry
+from app.lifting.stature import expected_stature_mm
 from library_store.skeleton import L_HIP, LSP14, R_HIP
+from models.pose_lifter import LearnedPose
 
 _LIMBS = ("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")
 _LIMB_ENDS = np.stack(
@@ -56,6 +60,7 @@ class FusionSettings:
 
     ``bandwidth_px``, ``adaptive``, ``granularity_px``, ``localisation_bones``: see
     ``ensemble.local_prior``; ``proportion_spread``: see ``ensemble.place_ensemble``;
+    ``doubt``: see ``learned.with_learned``;
     ``asymmetry``: standard deviation of the log ratio of two sides' lengths; ``noise_px``: the
     noise levels ν that are weighed by evidence; ``outlier_prior``: probability that a joint of
     full confidence is elsewhere. Depth is ambiguous if a limb's far end is within
@@ -68,6 +73,7 @@ class FusionSettings:
     granularity_px: float = 2.0
     localisation_bones: float = 20.0
     proportion_spread: float = 0.1
+    doubt: float = 2.0
     asymmetry: float = 0.15
     noise_px: tuple[float, ...] = (1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0)
     outlier_prior: float = 0.06
@@ -98,6 +104,7 @@ def fuse(
     confidence: Floats,
     covariance_px2: Floats | None,
     settings: FusionSettings,
+    learned: LearnedPose | None = None,
 ) -> FusedPose:
     """Update the ensemble's Gaussian by the observed joints.
 
@@ -107,6 +114,7 @@ def fuse(
         confidence: (J,) 0 = missing.
         covariance_px2: (J, 2, 2) of the observation in standard pixels², or None.
         settings: the local prior.
+        learned: what the network says of the same joints, or None.
 
     """
     seen = np.flatnonzero(confidence > 0)
@@ -135,7 +143,10 @@ def fuse(
         prior.covariance - pulled @ gain.T,
         prior.root_depth_mm,
     )
+    if learned is not None:
+        posterior = with_learned(posterior, learned, ensemble.px_per_unit, settings.doubt)
     posterior = _made_symmetric(posterior, ensemble.px_per_unit, settings.asymmetry)
+    posterior = _made_as_tall(posterior, ensemble.px_per_unit, ensemble.stature_mm)
     suspect = evidence.suspect(confidence[seen], settings.outlier_prior)
     return FusedPose(
         joints_mm=_joints(posterior, ensemble.px_per_unit),
@@ -169,6 +180,17 @@ def _made_symmetric(pose: LocalPrior, px_per_unit: float, sigma: float) -> Local
     return LocalPrior(
         pose.mean - gain @ ratio, pose.covariance - gain @ reach.T, pose.root_depth_mm
     )
+
+
+def _made_as_tall(pose: LocalPrior, px_per_unit: float, stature_mm: float) -> LocalPrior:
+    """At the distance at which the person is so tall; no image or direction changes."""
+    n = LSP14.n_joints
+    depth = pose.root_depth_mm
+    image = pose.covariance[: 2 * n, : 2 * n].reshape(n, 2, n, 2) * (depth / px_per_unit) ** 2
+    along = pose.covariance[2 * n :, 2 * n :] * depth**2
+    covariance = np.stack([image[:, 0, :, 0], image[:, 1, :, 1], along])
+    expected = expected_stature_mm(_joints(pose, px_per_unit), covariance)
+    return replace(pose, root_depth_mm=depth * stature_mm / expected)
 
 
 def _is_ambiguous(pose: LocalPrior, settings: FusionSettings) -> bool:

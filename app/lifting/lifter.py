@@ -31,6 +31,7 @@ from app.lifting.types import (
 from app.lifting.warp import warp_perspective, warp_weak_perspective
 from library_store.library import Library
 from library_store.skeleton import L_HIP, L_SHOULDER, NECK, R_HIP, R_SHOULDER
+from models.pose_lifter import PoseLifter
 
 MIN_JOINTS = 6
 """A camera has six unknowns; with fewer joints (two equations each) every exemplar fits."""
@@ -99,10 +100,19 @@ class _Shortlist:
 
 
 class Lifter:
-    """Lifts people with one library; immutable and safe to share between threads."""
+    """Lifts people with one library; immutable and safe to share between threads.
 
-    def __init__(self, library: Library, settings: LiftingSettings | None = None) -> None:
+    ``network``: a learned lifter whose answer the fusion observes too, or None.
+    """
+
+    def __init__(
+        self,
+        library: Library,
+        settings: LiftingSettings | None = None,
+        network: PoseLifter | None = None,
+    ) -> None:
         self._library = library
+        self._network = network
         self._settings = settings or LiftingSettings()
 
     def lift(
@@ -255,7 +265,8 @@ class Lifter:
         covariance = view.covariance
         if covariance is not None:
             covariance = covariance * ensemble.px_per_unit**2
-        return fuse(ensemble, view.points, confidence, covariance, self._settings.fusion)
+        learned = None if self._network is None else self._network.lift(view.points, weights)
+        return fuse(ensemble, view.points, confidence, covariance, self._settings.fusion, learned)
 
     def _shortlist(
         self, view: CentredView, confidence: Floats, neighbours: _Neighbours

@@ -250,8 +250,8 @@ class Network(TypedDict):
     """A network in service: what it is, and what runs it in which precision."""
 
     gflop: float
-    input_px: int
-    kind: Literal["pose", "people"]
+    input_px: int | None
+    kind: Literal["pose", "people", "lift"]
     name: str
     parameters: int
     precision: Literal["fp32", "bf16", "int8"]
@@ -335,7 +335,8 @@ class PoseParameters(TypedDict):
 
     # Most people to answer.
     max_people: NotRequired[int]
-    # How many of the shortlist to return; never changes the answer.
+    # How many of the shortlist (30; 10 with `method=paper`) to return at most; never changes the
+    # answer.
     candidates: NotRequired[int]
     # `paper` is the method of Chen & Ramanan (2017) to the letter.
     method: NotRequired[Literal["fusion", "paper"]]

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from evaluation.metrics import summarise
+from evaluation.networks import add_network_option, network_of
 from evaluation.paper.network import Network
 from evaluation.paper.systems import Seen2D, System, default_method, learned, paper_method
 from evaluation.paper.views import Views, of_lifting_set
@@ -43,11 +44,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, action="append", required=True)
     parser.add_argument("--people", type=int, default=None, help="only N, spread over each set")
     parser.add_argument("--only", action="append", help="a method; repeatable; default all")
+    add_network_option(parser)
     chosen = parser.parse_args(arguments)
     library, network = load(chosen.library), Network.load(chosen.mlp)
+    lifter = network_of(chosen.network, library)
     systems = [
         System("paper", paper_method(library)),
-        System("default", default_method(library)),
+        System("default", default_method(library, lifter)),
+        System("default, matching alone", default_method(library)),
         System("MLP", learned(network, warped=False)),
         System("MLP, warped", learned(network, warped=True)),
     ]

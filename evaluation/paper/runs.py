@@ -292,13 +292,13 @@ def _systems(frames: Library, options: Options) -> list[System]:
     """The paper's method on training frames first; then ours, and what the options add."""
     systems = [
         System("paper's method, training frames", paper_method(frames)),
-        System("default, training frames", default_method(frames)),
+        System("default by matching alone, training frames", default_method(frames)),
     ]
     if options.library is not None:
         own = load(options.library)
         systems += [
             System(f"paper's method, {own.manifest.name}", paper_method(own)),
-            System(f"default, {own.manifest.name}", default_method(own)),
+            System(f"default by matching alone, {own.manifest.name}", default_method(own)),
         ]
     if options.mlp is not None:
         network = Network.load(options.mlp)

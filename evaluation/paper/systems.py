@@ -21,6 +21,7 @@ from evaluation.metrics import align, rigid_error_mm
 from evaluation.paper.network import Network, warp_onto
 from evaluation.paper.views import SceneCamera, Views
 from library_store.library import Library
+from models.pose_lifter import PoseLifter
 
 CANDIDATES = 1_000
 """Exemplars, nearest by their inter-joint distances, among which the optimal one is sought."""
@@ -89,9 +90,9 @@ def paper_method(library: Library, k: int = 10) -> Lift:
     return _by_lifter(library, "paper", LiftingSettings(paper_shortlist=k))
 
 
-def default_method(library: Library) -> Lift:
-    """What the service answers by default."""
-    return _by_lifter(library, "fusion", LiftingSettings())
+def default_method(library: Library, network: PoseLifter | None = None) -> Lift:
+    """What the service answers by default, with its lifting network or by matching alone."""
+    return _by_lifter(library, "fusion", LiftingSettings(), network)
 
 
 def learned(network: Network, *, warped: bool) -> Lift:
@@ -153,8 +154,13 @@ def optimal_exemplars(library: Library, views: Views) -> Floats:
     return align(best[which], views.joints_mm, scale=False)
 
 
-def _by_lifter(library: Library, method: Method, settings: LiftingSettings) -> Lift:
-    lifter = Lifter(library, settings)
+def _by_lifter(
+    library: Library,
+    method: Method,
+    settings: LiftingSettings,
+    network: PoseLifter | None = None,
+) -> Lift:
+    lifter = Lifter(library, settings, network)
 
     def lift(views: Views, seen: Seen2D) -> Answers:
         answer = np.empty_like(views.joints_mm)

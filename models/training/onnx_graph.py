@@ -181,14 +181,22 @@ class GraphWriter:
         )
         return self.node("Relu", self.norm(y, norm))
 
-    def model(self, result: str, image: Axes, maps: Axes) -> onnx.ModelProto:
+    def model(
+        self,
+        result: str,
+        given: Axes,
+        found: Axes,
+        *,
+        kind: int = onnx.TensorProto.UINT8,
+        names: tuple[str, str] = (INPUT, OUTPUT),
+    ) -> onnx.ModelProto:
         """The finished, checked model; the axes of its input and output have a name or a size."""
-        self._nodes.append(helper.make_node("Identity", [result], [OUTPUT], OUTPUT))
+        self._nodes.append(helper.make_node("Identity", [result], [names[1]], names[1]))
         graph = helper.make_graph(
             self._nodes,
             type(self.network).__name__,
-            [helper.make_tensor_value_info(INPUT, onnx.TensorProto.UINT8, image)],
-            [helper.make_tensor_value_info(OUTPUT, onnx.TensorProto.FLOAT, maps)],
+            [helper.make_tensor_value_info(names[0], kind, given)],
+            [helper.make_tensor_value_info(names[1], onnx.TensorProto.FLOAT, found)],
             list(self._initializers.values()),
         )
         model = helper.make_model(

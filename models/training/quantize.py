@@ -30,7 +30,7 @@ from onnxruntime.quantization import (
     quantize_static,
 )
 
-from models.card import WEIGHTS_DIR, ModelCard, PoseOutput, read_card
+from models.card import WEIGHTS_DIR, DetectorOutput, ModelCard, PoseOutput, read_card
 from models.person_detector import PersonDetector, iou, shrunk
 from models.providers import INT8_FEATURES
 from models.training.augment import canonical
@@ -266,12 +266,14 @@ def main() -> None:
         card = quantize(
             args.weights, args.name, (canonical(crops[i], output.input_px).image for i in picked)
         )
-    else:
+    elif isinstance(output, DetectorOutput):
         scenes = list(decode_members(args.data / args.scenes).values())
         long = output.long_side_px
         card = quantize(args.weights, args.name, (shrunk(s, long)[0] for s in scenes[1::2]))
         kept = same_boxes(args.weights, (args.name, card.name), scenes[0::2])
         print({f"boxes_shared_with_{args.name}": round(kept, 4)})
+    else:
+        parser.error(f"{args.name} is a {output.kind} network, which gains nothing by 8 bits")
     print(card.model_dump_json(include={"name", "file", "sha256"}))
 
 

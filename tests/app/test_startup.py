@@ -67,6 +67,15 @@ def test_missing_and_corrupt_model(tmp_path: Path, library_dir: Path) -> None:
     assert "cpm.onnx" in said or "cpm-int8.onnx" in said
 
 
+def test_missing_lifter(tmp_path: Path, library_dir: Path) -> None:
+    weights = tmp_path / "weights"
+    shutil.copytree(WEIGHTS_DIR, weights)
+    (weights / "lifter.json").unlink()
+    said = refusal(tmp_path, library_dir=library_dir, weights_dir=weights)
+    assert "lifter.json is missing" in said
+    assert "POSEMATCH_LIFTER=off" in said
+
+
 def test_unwritable_cache(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("not a directory")

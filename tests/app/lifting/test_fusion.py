@@ -3,9 +3,10 @@ import pytest
 
 from app.lifting.ensemble import Ensemble, localisation, place_ensemble
 from app.lifting.fusion import FusionSettings, fuse
-from app.lifting.geometry import Floats, normalised_projection
+from app.lifting.geometry import Floats, lift_to_depth, normalised_projection
 from app.lifting.posterior import standard_px_per_unit
 from app.lifting.proportions import asymmetry
+from app.lifting.stature import stature_mm
 from evaluation.metrics import similarity_error_mm
 from library_store.library import Library
 
@@ -22,8 +23,10 @@ def linear_world(n: int = 200, seed: int = 0) -> tuple[Ensemble, Floats, Floats]
     codes = rng.normal(size=(n + 1, 4))
     people = base + np.einsum("nm,mjd->njd", codes, modes) * [6.0, 6.0, 0.01]
     states = np.concatenate([people[:n, :, :2].reshape(n, 28), people[:n, :, 2]], axis=1)
-    ensemble = Ensemble(states, np.full(n, ROOT_DEPTH_MM), np.zeros((0, 42)), PX)
-    return ensemble, people[n, :, :2] / PX, ROOT_DEPTH_MM * (1 + people[n, :, 2])
+    points, depth = people[n, :, :2] / PX, ROOT_DEPTH_MM * (1 + people[n, :, 2])
+    height = float(stature_mm(lift_to_depth(points, depth)))
+    ensemble = Ensemble(states, np.full(n, ROOT_DEPTH_MM), np.zeros((0, 42)), PX, height)
+    return ensemble, points, depth
 
 
 EXACT = FusionSettings(

@@ -1,0 +1,48 @@
+"""What a learned lifter says of a person, as one more observation of the fused state.
+
+The network (``models.pose_lifter``) has seen ever new views of people of many builds and errs
+otherwise than the neighbours do. Its answer is a state as in ``app.lifting.ensemble`` and comes
+with the covariance of its errors, so the update is that of any observation:
+
+    x̂ = x + P (P + κ R)⁻¹ (y - x)
+
+with P the fused posterior and R the network's covariance. Both have looked at the same 2D joints,
+so their errors are not independent: that is what κ > 1 (``doubt``) allows for. How large the
+person is stays what the neighbours say; the network does not know.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from app.lifting.ensemble import LocalPrior
+from library_store.skeleton import LSP14
+from models.pose_lifter import LearnedPose
+
+_SETTLED_PX = 0.1
+"""Spread added to each coordinate: a depth relative to the root's has none along the root's."""
+
+
+def with_learned(
+    pose: LocalPrior, learned: LearnedPose, px_per_unit: float, doubt: float
+) -> LocalPrior:
+    """``pose`` after this observation.
+
+    Args:
+        pose: a Gaussian over states.
+        learned: the network's answer in the same view.
+        px_per_unit: standard pixels in a normalised unit.
+        doubt: what the covariance of the network's errors is multiplied by.
+
+    """
+    n = LSP14.n_joints
+    to_state = np.concatenate([np.full(2 * n, px_per_unit), np.ones(n)])
+    settled = _SETTLED_PX * to_state / px_per_unit
+    error = doubt * to_state[:, None] * learned.covariance * to_state + np.diag(settled**2)
+    seen = np.concatenate([px_per_unit * learned.points.ravel(), learned.depths])
+    gain = np.linalg.solve(pose.covariance + error, pose.covariance).T
+    return LocalPrior(
+        pose.mean + gain @ (seen - pose.mean),
+        pose.covariance - gain @ pose.covariance,
+        pose.root_depth_mm,
+    )

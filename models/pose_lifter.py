@@ -1,0 +1,73 @@
+"""p(X | x), learned: 2D joints to where they are in 3D, and how far that may be wrong.
+
+A small residual MLP after Martinez et al. (ICCV 2017). It knows neither size nor distance: joints
+go in as the camera sees them, and out come, for each, where in the image it really is and how much
+nearer or farther than the hips, relative to the hips' own distance. ``models.training.lifter`` has
+the architecture and what it is trained on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from library_store.skeleton import LSP14
+from models.card import WEIGHTS_DIR, LiftOutput, ModelCard
+from models.errors import ModelError
+from models.providers import Runtime
+from models.session import OnnxModel
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LearnedPose:
+    """What the network says of a person.
+
+    ``points`` (14, 2) normalised image coordinates of the joints; ``depths`` (14,) their depths
+    relative to the hip midpoint's, ``z / z_root - 1``; ``covariance`` (42, 42) of the errors of
+    both, x and y of the first joint first, the depths last.
+    """
+
+    points: Floats
+    depths: Floats
+    covariance: Floats
+
+
+class PoseLifter:
+    """The lifting network with its card. Thread-safe; always on the CPU, where it takes a blink."""
+
+    def __init__(self, name: str = "lifter", *, weights_dir: Path = WEIGHTS_DIR) -> None:
+        self._model = OnnxModel(weights_dir, name, provider="cpu")
+        output = self._model.card.output
+        if not isinstance(output, LiftOutput):
+            raise ModelError(f"model {name} is no lifter: its card says {output.kind}")
+        if tuple(output.joint_names) != LSP14.joint_names:
+            raise ModelError(f"model {name} has other joints than lsp14: {output.joint_names}")
+
+    @property
+    def card(self) -> ModelCard:
+        """The network's model card."""
+        return self._model.card
+
+    @property
+    def runtime(self) -> Runtime:
+        """The provider in use and the precision it runs the network in."""
+        return self._model.runtime
+
+    def lift(self, points: Floats, present: Floats) -> LearnedPose:
+        """Lift one person.
+
+        Args:
+            points: (14, 2) normalised image coordinates, the camera turned onto the person.
+            present: (14,) 0 = missing, whose point is ignored; two joints at least.
+
+        """
+        seen = present > 0
+        joints = np.concatenate([np.where(seen[:, None], points, 0.0), seen[:, None]], axis=1)
+        answer = self._model.run(joints[None].astype(np.float32))[0].astype(np.float64)
+        n = 2 * LSP14.n_joints
+        return LearnedPose(answer[0, :n].reshape(-1, 2), answer[0, n:], answer[1:])

@@ -1,0 +1,237 @@
+"""The learned lifter in torch, and as an ONNX graph: a residual MLP from 2D joints to a pose.
+
+After Martinez et al. (ICCV 2017), with 14 joints, a mask of missing ones, RMS norm in place of
+batch norm, and everything in units that hold at any size and distance: ``c`` and ``r`` are the mean
+and the RMS radius of the present joints in normalised image coordinates.
+
+    f = ((x - c) / r, present, log r);   h₀ = relu(W f);   h ← h + V relu(U h / rms(h)) per block
+
+Of the last layer: where the joints really are in the image, as a correction in units of r; depths
+about the root's, ``z / z_root - 1``, in units of r; the logarithm of the body's radius in mm,
+``log(r z_root)``; and the logarithms of the standard deviations of all these, one for both image
+coordinates of a joint. The radius is learned beside the rest and not exported: how large people
+are, the library says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import onnx
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from library_store.skeleton import L_HIP, LSP14, R_HIP
+from models.training.onnx_graph import GraphWriter
+
+N = LSP14.n_joints
+LOG_RADIUS = -2.0
+"""About the logarithm of a person's radius in normalised image coordinates."""
+LOG_SIZE = 5.75
+"""About that of a person's radius in mm."""
+_RMS_FLOOR = 1e-4
+_TINY = 1e-12
+_IMAGE, _DEPTH = slice(0, 2 * N), slice(2 * N, 3 * N)
+_SIZE = 3 * N
+_ACROSS, _ALONG = slice(3 * N + 1, 4 * N + 1), slice(4 * N + 1, 5 * N + 1)
+_SIZE_SIGMA = 5 * N + 1
+
+
+class PoseMlp(nn.Module):
+    """Features (N, 43) -> the last layer (N, 72), float32; see the module."""
+
+    def __init__(self, width: int = 512, n_blocks: int = 3) -> None:
+        super().__init__()
+        self.first = nn.Linear(3 * N + 1, width)
+        self.blocks = nn.ModuleList(
+            nn.ModuleList((nn.Linear(width, width), nn.Linear(width, width)))
+            for _ in range(n_blocks)
+        )
+        self.last = nn.Linear(width, 5 * N + 2)
+        with torch.no_grad():
+            for layer in (self.first, *(block[0] for block in self.blocks)):
+                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+                nn.init.zeros_(layer.bias)
+            for block in self.blocks:
+                block[1].weight.mul_(0.1)
+                nn.init.zeros_(block[1].bias)
+            nn.init.zeros_(self.last.weight)
+            nn.init.zeros_(self.last.bias)
+            self.last.bias[_SIZE + 1 :] = -2.0
+
+    def forward(self, features: Tensor) -> Tensor:
+        """The last layer is computed in single precision whatever the rest is computed in."""
+        hidden = torch.relu(self.first(features))
+        for block in self.blocks:
+            hidden = hidden + block[1](torch.relu(block[0](_unit(hidden))))
+        with torch.autocast(hidden.device.type, enabled=False):
+            return functional.linear(_unit(hidden.float()), self.last.weight, self.last.bias)
+
+
+def _unit(hidden: Tensor) -> Tensor:
+    return hidden * torch.rsqrt((hidden * hidden).mean(1, keepdim=True) + _RMS_FLOOR)
+
+
+def normalised(points: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Features (N, 43), c (N, 1, 2), r (N, 1, 1) of points (N, 14, 2) and their mask (N, 14)."""
+    shares = (present / present.sum(1, keepdim=True))[..., None]
+    centre = (shares * points).sum(1, keepdim=True)
+    centred = (points - centre) * present[..., None]
+    radius = torch.sqrt((shares * centred**2).sum((1, 2), keepdim=True) + _TINY)
+    shape = (centred / radius).flatten(1)
+    return torch.cat([shape, present, radius.log()[:, 0] - LOG_RADIUS], 1), centre, radius
+
+
+@dataclass(frozen=True)
+class Last:
+    """The last layer by what it says, see the module; (N, 14, 2), (N, 14) or (N,)."""
+
+    image: Tensor
+    depths: Tensor
+    log_size: Tensor
+    log_across: Tensor
+    log_along: Tensor
+    log_size_sigma: Tensor
+
+
+def read_last(last: Tensor) -> Last:
+    """(N, 72) taken apart; the logarithms of deviations within reason."""
+    return Last(
+        last[:, _IMAGE].view(-1, N, 2),
+        last[:, _DEPTH],
+        last[:, _SIZE],
+        last[:, _ACROSS].clamp(-7, 2),
+        last[:, _ALONG].clamp(-7, 2),
+        last[:, _SIZE_SIGMA].clamp(-7, 2),
+    )
+
+
+def losses(last: Tensor, image: Tensor, depths: Tensor, log_size: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean distance of joints and sizes from the truth, and how badly the errors were foretold.
+
+    The second is the Gaussian negative log likelihood with the errors held fixed: unsure joints
+    are no less learned.
+
+    Args:
+        last: (N, 72).
+        image: (N, 14, 2) the true corrections.
+        depths: (N, 14) the true depths, both in units of r.
+        log_size: (N,) the true logarithm, less ``LOG_SIZE``.
+
+    """
+    said = read_last(last)
+    across2 = ((said.image - image) ** 2).sum(-1)
+    along2 = (said.depths - depths) ** 2
+    size2 = (said.log_size - log_size) ** 2
+    distance = torch.sqrt(across2 + along2 + 1e-5).mean() + 0.2 * torch.sqrt(size2 + 1e-5).mean()
+    across, along, size = said.log_across, said.log_along, said.log_size_sigma
+    surprise = (0.5 * across2.detach() * torch.exp(-2 * across) + 2 * across).mean()
+    surprise = surprise + (0.5 * along2.detach() * torch.exp(-2 * along) + along).mean()
+    foretold = 0.5 * size2.detach() * torch.exp(-2 * size) + size
+    return distance, surprise + 0.1 * foretold.mean()
+
+
+def lifter_model(network: PoseMlp, moments: NDArray[np.float64]) -> onnx.ModelProto:
+    """The network as ``models.pose_lifter`` runs it.
+
+    Joints (n, 14, 3), x and y in normalised image coordinates and whether they are there, to
+    (n, 43, 42): a state (x, y of each joint, then the depths) and the covariance of its errors.
+    Each person is seen in a mirror too and the two answers averaged, so that left and right are
+    the same to it.
+
+    Args:
+        network: the trained network.
+        moments: (42, 42) second moments of the errors in units of the foretold deviations.
+
+    """
+    w = GraphWriter(network)
+    mirror = np.array(LSP14.mirror)
+
+    def number(value: float) -> str:
+        return w.constant(np.array(value, np.float32))
+
+    def sum_over(value: str, *axes: int) -> str:
+        return w.node("ReduceSum", value, w.shape(*axes), keepdims=1)
+
+    def cut(value: str, begin: int, end: int, axis: int) -> str:
+        return w.node("Slice", value, w.shape(begin), w.shape(end), w.shape(axis))
+
+    def halves(value: str) -> tuple[str, str]:
+        first = w.node("Shape", "joints", start=0, end=1)
+        second = w.node("Add", first, first)
+        zero, axis = w.shape(0), w.shape(0)
+        return (
+            w.node("Slice", value, zero, first, axis),
+            w.node("Slice", value, first, second, axis),
+        )
+
+    def mean_of(value: str, order: NDArray[np.int64], signs: NDArray[np.float32]) -> str:
+        plain, mirrored = halves(value)
+        back = w.node("Gather", mirrored, w.constant(order), axis=1)
+        back = w.node("Mul", back, w.constant(signs))
+        return w.node("Mul", w.node("Add", plain, back), number(0.5))
+
+    flipped = w.node("Gather", "joints", w.constant(mirror), axis=1)
+    flipped = w.node("Mul", flipped, w.constant(np.array([-1, 1, 1], np.float32)))
+    both = w.node("Concat", "joints", flipped, axis=0)
+    points, present = cut(both, 0, 2, 2), cut(both, 2, 3, 2)
+    shares = w.node("Div", present, sum_over(present, 1))
+    centre = sum_over(w.node("Mul", shares, points), 1)
+    centred = w.node("Mul", w.node("Sub", points, centre), present)
+    square = w.node("Mul", w.node("Mul", shares, centred), centred)
+    radius = w.node("Sqrt", w.node("Add", sum_over(square, 1, 2), number(_TINY)))
+    shape = w.node("Reshape", w.node("Div", centred, radius), w.shape(-1, 2 * N))
+    mask = w.node("Reshape", present, w.shape(-1, N))
+    flat_radius = w.node("Reshape", radius, w.shape(-1, 1))
+    log_radius = w.node("Sub", w.node("Log", flat_radius), number(LOG_RADIUS))
+
+    def linear(value: str, module: nn.Linear) -> str:
+        weight, bias = w.parameter(module, "weight"), w.parameter(module, "bias")
+        return w.node("Gemm", value, weight, bias, transB=1)
+
+    def unit(value: str) -> str:
+        square = w.node("ReduceMean", w.node("Mul", value, value), axes=[1], keepdims=1)
+        return w.node("Div", value, w.node("Sqrt", w.node("Add", square, number(_RMS_FLOOR))))
+
+    features = w.node("Concat", shape, mask, log_radius, axis=1)
+    hidden = w.node("Relu", linear(features, network.first))
+    for inner, outer in network.blocks:  # type: ignore[misc]
+        step = linear(w.node("Relu", linear(unit(hidden), inner)), outer)
+        hidden = w.node("Add", hidden, step)
+    last = linear(unit(hidden), network.last)
+
+    image = w.node("Add", shape, cut(last, _IMAGE.start, _IMAGE.stop, 1))
+    depth = cut(last, _DEPTH.start, _DEPTH.stop, 1)
+    across = cut(last, _ACROSS.start, _ACROSS.stop, 1)
+    twice = w.node("Gather", across, w.constant(np.repeat(np.arange(N), 2)), axis=1)
+    log_sigma = w.node("Concat", twice, cut(last, _ALONG.start, _ALONG.stop, 1), axis=1)
+    order = np.concatenate([(2 * mirror[:, None] + [0, 1]).ravel(), 2 * N + mirror])
+    signs = np.concatenate([np.tile([-1.0, 1.0], N), np.ones(N)]).astype(np.float32)
+    state = mean_of(w.node("Concat", image, depth, axis=1), order, signs)
+    log_sigma = mean_of(log_sigma, order, np.ones(3 * N, np.float32))
+
+    # From the root: depths about the mean of the hips' own.
+    about_root = np.eye(3 * N, dtype=np.float32)
+    about_root[2 * N + np.array([R_HIP, L_HIP]), 2 * N :] -= 0.5
+    state = w.node("MatMul", state, w.constant(about_root))
+    scale, _ = halves(flat_radius)
+    origin = w.node("Reshape", halves(centre)[0], w.shape(-1, 2))
+    origin = w.node("Gather", origin, w.constant(np.tile([0, 1], N)), axis=1)
+    origin = w.node("Pad", origin, w.shape(0, 0, 0, N))
+    state = w.node("Add", w.node("Mul", state, scale), origin)
+    sigma = w.node("Mul", w.node("Exp", log_sigma), scale)
+    columns = w.node("Reshape", sigma, w.shape(-1, 3 * N, 1))
+    rows = w.node("Reshape", sigma, w.shape(-1, 1, 3 * N))
+    covariance = w.node("Mul", columns, w.constant(moments.astype(np.float32)))
+    covariance = w.node("Mul", covariance, rows)
+    state = w.node("Reshape", state, w.shape(-1, 1, 3 * N))
+    return w.model(
+        w.node("Concat", state, covariance, axis=1),
+        ("n", N, 3),
+        ("n", 1 + 3 * N, 3 * N),
+        kind=onnx.TensorProto.FLOAT,
+        names=("joints", "answer"),
+    )

@@ -1,0 +1,81 @@
+"""The learned lifter as an observation: between no trust and all of it, and what it is worth."""
+
+import numpy as np
+import pytest
+
+from app.lifting.ensemble import LocalPrior
+from app.lifting.learned import with_learned
+from app.lifting.lifter import Lifter, LiftingSettings
+from evaluation.metrics import rigid_error_mm
+from library_store.library import Library
+from models import PoseLifter
+from models.pose_lifter import LearnedPose
+from tests.app.lifting.conftest import People, lift_one, observe
+
+PX_PER_UNIT = 1100.0
+
+
+@pytest.fixture(scope="module")
+def both(library: Library) -> Lifter:
+    return Lifter(library, network=PoseLifter())
+
+
+def gaussian(seed: int, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(42, 60))
+    unit = np.concatenate([np.full(28, scale), np.full(14, scale / PX_PER_UNIT)])
+    return unit * rng.normal(size=42), np.outer(unit, unit) * (root @ root.T) / 60
+
+
+def test_doubt_goes_from_the_network_to_the_neighbours() -> None:
+    mean, covariance = gaussian(1, 10.0)
+    pose = LocalPrior(mean, covariance, 4000.0)
+    said, error = gaussian(2, 10.0)
+    to_unit = np.concatenate([np.full(28, 1.0 / PX_PER_UNIT), np.ones(14)])
+    learned = LearnedPose(
+        (said * to_unit)[:28].reshape(14, 2), said[28:], np.outer(to_unit, to_unit) * error
+    )
+    unsure = with_learned(pose, learned, PX_PER_UNIT, 1e12)
+    np.testing.assert_allclose(unsure.mean, mean, atol=1e-6)
+    sure = with_learned(pose, learned, PX_PER_UNIT, 1e-9)
+    np.testing.assert_allclose(sure.mean * to_unit, said * to_unit, atol=2e-3)
+    halfway = with_learned(pose, learned, PX_PER_UNIT, 1.0)
+    assert (np.diag(halfway.covariance) < np.diag(covariance)).all()
+    assert halfway.root_depth_mm == 4000.0, "the network does not know how large people are"
+
+
+def test_it_helps(lifter: Lifter, both: Lifter, people: People) -> None:
+    errors = []
+    for one in (lifter, both):
+        found = np.stack([lift_one(one, people.observation(i)).joints_3d_mm for i in range(40)])
+        errors.append(rigid_error_mm(found, people.joints_mm).mean())
+    assert errors[1] < 0.9 * errors[0]
+
+
+def test_without_trust_it_changes_nothing(library: Library, people: People) -> None:
+    settings = LiftingSettings()
+    doubtful = LiftingSettings(
+        fusion=type(settings.fusion)(**{**vars(settings.fusion), "doubt": 1e14})
+    )
+    alone = lift_one(Lifter(library), people.observation(0))
+    beside = lift_one(Lifter(library, doubtful, PoseLifter()), people.observation(0))
+    np.testing.assert_allclose(beside.joints_3d_mm, alone.joints_3d_mm, atol=1e-3)
+
+
+def test_missing_joints_are_less_sure_and_matter_little_to_others(
+    both: Lifter, people: People
+) -> None:
+    whole = lift_one(both, people.observation(3))
+    without = lift_one(both, observe(people.joints_px[3], missing=(4, 10)))
+    assert whole.sigma_mm is not None
+    assert without.sigma_mm is not None
+    assert (without.sigma_mm[[4, 10]] > whole.sigma_mm[[4, 10]]).all()
+    moved = np.linalg.norm(without.joints_3d_mm - whole.joints_3d_mm, axis=1)
+    assert np.delete(moved, [4, 10]).mean() < 60.0
+
+
+def test_the_papers_method_does_not_ask_it(lifter: Lifter, both: Lifter, people: People) -> None:
+    answers = [
+        lift_one(one, people.observation(1), method="paper").joints_3d_mm for one in (lifter, both)
+    ]
+    np.testing.assert_array_equal(answers[0], answers[1])

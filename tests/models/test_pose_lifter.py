@@ -1,0 +1,131 @@
+"""The lifting network that ships: what must hold for any joints, and what its card promises."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from library_store.cameras import extrinsics, sample_cameras
+from library_store.prior import PosePrior
+from library_store.skeleton import L_HIP, L_WRIST, LSP14, R_HIP
+from models import ModelError, PersonDetector, PoseLifter
+from models.card import WEIGHTS_DIR, read_card
+
+Floats = NDArray[np.float64]
+EVERYBODY = np.ones(14)
+
+
+@pytest.fixture(scope="module")
+def lifter() -> PoseLifter:
+    return PoseLifter()
+
+
+@pytest.fixture(scope="module")
+def seen() -> Floats:
+    """People (60, 14, 3) of the prior in front of cameras that look at their middle, mm."""
+    rng = np.random.default_rng(5)
+    poses = PosePrior.load().sample(60, rng)
+    rotation, translation = extrinsics(sample_cameras(60, rng), poses)
+    placed: Floats = poses @ np.swapaxes(rotation, 1, 2) + translation[:, None]
+    return placed
+
+
+def image(seen: Floats) -> Floats:
+    points: Floats = seen[..., :2] / seen[..., 2:]
+    return points
+
+
+def true_depths(seen: Floats) -> Floats:
+    root = 0.5 * (seen[:, [R_HIP], 2] + seen[:, [L_HIP], 2])
+    depths: Floats = seen[..., 2] / root - 1.0
+    return depths
+
+
+def test_it_finds_depths_and_its_deviations_are_of_that_size(
+    lifter: PoseLifter, seen: Floats
+) -> None:
+    found = [lifter.lift(points, EVERYBODY) for points in image(seen)]
+    errors = np.stack([pose.depths for pose in found]) - true_depths(seen)
+    assert np.sqrt((errors**2).mean()) < 0.5 * np.sqrt((true_depths(seen) ** 2).mean())
+    sigma = np.sqrt(np.stack([np.diag(pose.covariance)[28:] for pose in found]))
+    assert 0.6 < (np.abs(errors) < sigma).mean() < 0.95
+    sure = sigma.mean(1) < np.median(sigma.mean(1))
+    assert np.abs(errors[sure]).mean() < np.abs(errors[~sure]).mean()
+
+
+def test_what_is_true_of_a_person_is_true_in_the_mirror(lifter: PoseLifter, seen: Floats) -> None:
+    mirror = list(LSP14.mirror)
+    for points in image(seen)[:5]:
+        pose = lifter.lift(points, EVERYBODY)
+        flipped = lifter.lift((points * [-1.0, 1.0])[mirror], EVERYBODY)
+        np.testing.assert_allclose(flipped.depths, pose.depths[mirror], atol=1e-5)
+        np.testing.assert_allclose(flipped.points, pose.points[mirror] * [-1.0, 1.0], atol=1e-5)
+
+
+def test_where_the_person_is_in_the_picture_changes_nothing(
+    lifter: PoseLifter, seen: Floats
+) -> None:
+    points = image(seen)[0]
+    here = lifter.lift(points, EVERYBODY)
+    there = lifter.lift(points + np.array([0.02, -0.01]), EVERYBODY)
+    np.testing.assert_allclose(there.depths, here.depths, atol=1e-5)
+    np.testing.assert_allclose(there.points - here.points, [[0.02, -0.01]] * 14, atol=1e-5)
+
+
+def test_the_hips_are_at_the_root(lifter: PoseLifter, seen: Floats) -> None:
+    depths = lifter.lift(image(seen)[0], EVERYBODY).depths
+    assert depths[R_HIP] + depths[L_HIP] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_missing_joint_is_not_looked_at_and_is_less_sure(
+    lifter: PoseLifter, seen: Floats
+) -> None:
+    present = EVERYBODY.copy()
+    present[L_WRIST] = 0.0
+    ratios = []
+    for points in image(seen)[:20]:
+        whole = lifter.lift(points, EVERYBODY)
+        hidden = points.copy()
+        hidden[L_WRIST] = np.nan
+        without = lifter.lift(hidden, present)
+        hidden[L_WRIST] = 3.0
+        np.testing.assert_array_equal(lifter.lift(hidden, present).depths, without.depths)
+        variances = [np.diag(pose.covariance)[28 + L_WRIST] for pose in (without, whole)]
+        ratios.append(variances[0] / variances[1])
+    assert np.median(ratios) > 1.5
+
+
+def test_covariances_are_covariances(lifter: PoseLifter, seen: Floats) -> None:
+    for points in image(seen)[:5]:
+        covariance = lifter.lift(points, EVERYBODY).covariance
+        np.testing.assert_allclose(covariance, covariance.T, rtol=1e-5)
+        scale = np.sqrt(np.diag(covariance))
+        assert np.linalg.eigvalsh(covariance / np.outer(scale, scale)).min() > -1e-5
+
+
+def test_other_networks_are_no_lifters_and_it_is_none_of_theirs() -> None:
+    with pytest.raises(ModelError, match="no lifter"):
+        PoseLifter("person")
+    with pytest.raises(ModelError, match="no person detector"):
+        PersonDetector("lifter", provider="cpu")
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"), [("cut", "sha256 differs"), ("foreign", "one float input of joints")]
+)
+def test_damaged_and_foreign_weights_are_refused(tmp_path: Path, damage: str, said: str) -> None:
+    for suffix in (".onnx", ".json"):
+        shutil.copy(WEIGHTS_DIR / f"lifter{suffix}", tmp_path)
+    path = tmp_path / "lifter.onnx"
+    if damage == "cut":
+        path.write_bytes(path.read_bytes()[:-100])
+    else:
+        shutil.copy(WEIGHTS_DIR / "person.onnx", path)
+        card = read_card(WEIGHTS_DIR / "lifter.json")
+        person = read_card(WEIGHTS_DIR / "person.json")
+        card = card.model_copy(update={"sha256": person.sha256})
+        (tmp_path / "lifter.json").write_text(card.model_dump_json())
+    with pytest.raises(ModelError, match=said):
+        PoseLifter(weights_dir=tmp_path)
