@@ -1,4 +1,4 @@
-"""Compiles library_store/scan.cpp when the project is installed, in place or into a wheel."""
+"""Compiles the loops in C++ when the project is installed, in place or into a wheel."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-SOURCE, COMPILED = "library_store/scan.cpp", "library_store/_scan.so"
+COMPILED = {
+    "library_store/scan.cpp": "library_store/_scan.so",
+    "app/lifting/resection.cpp": "app/lifting/_resection.so",
+}
 FLAGS = ["-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC"]
 
 
-class CompileScan(BuildHookInterface):  # type: ignore[type-arg]
-    """The one part of the project that is not Python."""
+class CompileLoops(BuildHookInterface):  # type: ignore[type-arg]
+    """The parts of the project that are not Python."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:  # noqa: ARG002
         """Compile, and say that the wheel holds for this platform."""
@@ -23,10 +26,11 @@ class CompileScan(BuildHookInterface):  # type: ignore[type-arg]
         if compiler is None:
             raise SystemExit("a C++ compiler is needed (Debian: apt-get install g++)")
         root = Path(self.root)
-        # In one step, for the file may be in use.
-        unfinished = root / f"{COMPILED}.{os.getpid()}"
-        subprocess.run([compiler, *FLAGS, "-o", unfinished, root / SOURCE], check=True)
-        unfinished.replace(root / COMPILED)
-        build_data["artifacts"].append(COMPILED)
+        for source, compiled in COMPILED.items():
+            # In one step, for the file may be in use.
+            unfinished = root / f"{compiled}.{os.getpid()}"
+            subprocess.run([compiler, *FLAGS, "-o", unfinished, root / source], check=True)
+            unfinished.replace(root / compiled)
+            build_data["artifacts"].append(compiled)
         build_data["pure_python"] = False
         build_data["infer_tag"] = True

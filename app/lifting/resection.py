@@ -10,15 +10,21 @@ All image coordinates here are normalised (focal length 1, principal point (0, 0
 
 from __future__ import annotations
 
+import ctypes
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 
 from app.lifting.geometry import Floats
 
-_INITIAL_DAMPING = 1e-4
 _NEAREST_TO_EXTENT = 1.05
 """The root stays at least this many times the exemplar's forward extent away from the camera."""
+_LEAST_EXTENT_MM = 50.0
+_COMPILED = Path(__file__).with_name("_resection.so")
 
 
 @dataclass(frozen=True)
@@ -81,7 +87,7 @@ def resect(
     weights: Floats,
     *,
     iterations: int = 6,
-    robust_scale: Floats | float | None = None,
+    robust_scale: float | None = None,
 ) -> Cameras:
     """Solve eq. 5 for a batch.
 
@@ -100,144 +106,61 @@ def resect(
     """
     lead = exemplars_mm.shape[:-2]
     joints = exemplars_mm.shape[-2]
-    # Coordinates before joints from here on: that is how small products are fast.
-    points = np.swapaxes(exemplars_mm.reshape(-1, joints, 3), 1, 2).copy()
-    rotation = rotations.reshape(-1, 3, 3)
-    rotated = rotation @ points
-    if targets.ndim > 2 or weights.ndim > 1:
-        targets = np.broadcast_to(targets, (*lead, joints, 2)).reshape(-1, joints, 2)
-        weights = np.broadcast_to(weights, (*lead, joints)).reshape(-1, joints)
-    translation = initial_translation(rotated, targets, weights)
-    observed = np.swapaxes(targets, -1, -2)
-    weight = base_weight = weights[..., None, :]
-    damping = np.full(len(points), _INITIAL_DAMPING)
-    image, inverse = _image(rotated, translation)
-    residuals = image - observed
-    # Six derivatives of (x, y) by the camera, and the residual as the seventh row.
-    rows = np.zeros((len(points), 7, 2, joints))
-    for _ in range(iterations):
-        if robust_scale is not None:
-            # IRLS: the weight of this step is held while the step is judged.
-            squared = (residuals**2).sum(1, keepdims=True)
-            weight = base_weight / (1.0 + squared / robust_scale**2)
-        _fill_jacobian(rows, rotated, image, inverse)
-        rows[:, 6] = residuals
-        step, cost = _damped_step(rows, weight, damping)
-        new_rotation = rotation_exponential(step[:, :3]) @ rotation
-        new_rotated = new_rotation @ points
-        new_translation = translation + step[:, 3:]
-        ahead = new_translation[:, 2] >= _nearest_depth(new_rotated)
-        if not ahead.all():
-            new_translation[~ahead] = translation[~ahead]
-        new_image, new_inverse = _image(new_rotated, new_translation)
-        new_residuals = new_image - observed
-        new_cost = (weight * new_residuals**2).sum((1, 2))
-        better = ahead & (new_cost <= cost)
-        damping *= np.where(better, 0.1, 10.0)
-        if not better.all():
-            worse = ~better
-            new_rotation[worse], new_translation[worse] = rotation[worse], translation[worse]
-            new_rotated[worse], new_residuals[worse] = rotated[worse], residuals[worse]
-            new_image[worse], new_inverse[worse] = image[worse], inverse[worse]
-        rotation, translation, rotated = new_rotation, new_translation, new_rotated
-        image, inverse, residuals = new_image, new_inverse, new_residuals
-    placed = rotated + translation[:, :, None]
-    return Cameras(
-        rotation.reshape(*lead, 3, 3),
-        translation.reshape(*lead, 3),
-        np.swapaxes(placed, 1, 2).reshape(*lead, joints, 3),
-        np.swapaxes(residuals, 1, 2).reshape(*lead, joints, 2),
+    points = np.ascontiguousarray(exemplars_mm, dtype=np.float64)
+    rotation = np.array(rotations, dtype=np.float64, order="C")
+    shared = targets.ndim == 2 and weights.ndim == 1
+    if not shared:
+        targets = np.broadcast_to(targets, (*lead, joints, 2))
+        weights = np.broadcast_to(weights, (*lead, joints))
+    targets = np.ascontiguousarray(targets, dtype=np.float64)
+    weights = np.ascontiguousarray(weights, dtype=np.float64)
+    fits = targets.shape[-2:] == (joints, 2) and weights.shape[-1:] == (joints,)
+    if rotation.shape != (*lead, 3, 3) or not fits:
+        raise ValueError("exemplars, rotations, targets and weights do not belong together")
+    rotated = rotation @ np.swapaxes(points, -1, -2)
+    translation = np.ascontiguousarray(initial_translation(rotated, targets, weights))
+    placed, residuals = np.empty_like(points), np.empty((*lead, joints, 2))
+    _compiled()(
+        math.prod(lead),
+        joints,
+        points.ctypes.data,
+        targets.ctypes.data,
+        weights.ctypes.data,
+        shared,
+        iterations,
+        robust_scale or 0.0,
+        _NEAREST_TO_EXTENT,
+        _LEAST_EXTENT_MM,
+        rotation.ctypes.data,
+        translation.ctypes.data,
+        placed.ctypes.data,
+        residuals.ctypes.data,
     )
+    return Cameras(rotation, translation, placed, residuals)
 
 
-def projection_jacobian(rotated_mm: Floats, translation_mm: Floats) -> Floats:
-    """Derivative of the normalised projection by the camera.
-
-    The camera moves as ``exp([ω]×) R, t + τ``.
-
-    Args:
-        rotated_mm: (B, J, 3) ``R @ X``.
-        translation_mm: (B, 3).
-
-    Returns:
-        (B, 6, 2, J): by (ω, τ), of (x, y).
-
-    """
-    rotated = np.swapaxes(rotated_mm, 1, 2)
-    jacobian = np.zeros((len(rotated), 6, 2, rotated.shape[2]))
-    _fill_jacobian(jacobian, rotated, *_image(rotated, translation_mm))
-    return jacobian
-
-
-def _fill_jacobian(rows: Floats, rotated_mm: Floats, image: Floats, inverse: Floats) -> None:
-    """Write :func:`projection_jacobian` into the first six ``rows``, which were zeros at first.
-
-    ``rotated_mm`` (B, 3, J); ``image`` (B, 2, J) and ``inverse`` (B, 1, J) as of :func:`_image`.
-    """
-    # Of each joint: right, down and forward of the root, over its depth.
-    right, down, forward = (rotated_mm[:, axis] * inverse[:, 0] for axis in range(3))
-    np.multiply(image, -down[:, None], out=rows[:, 0])
-    rows[:, 0, 1] -= forward
-    np.multiply(image, right[:, None], out=rows[:, 1])
-    rows[:, 1, 0] += forward
-    np.negative(down, out=rows[:, 2, 0])
-    rows[:, 2, 1] = right
-    rows[:, 3, 0] = rows[:, 4, 1] = inverse[:, 0]
-    np.multiply(image, -inverse, out=rows[:, 5])
-
-
-def rotation_exponential(omega: Floats) -> Floats:
-    """Rotation matrices (B, 3, 3) of rotation vectors (B, 3), by Rodrigues' formula."""
-    squared = (omega**2).sum(-1)
-    half = np.maximum(0.5 * np.sqrt(squared), 1e-8)
-    sinc = np.sin(half) / half
-    # sin(a)/a and (1 - cos a)/a², by the half angle: exact also where a vanishes.
-    first, second = sinc * np.cos(half), 0.5 * sinc**2
-    cross = (omega @ _GENERATORS).reshape(-1, 3, 3)
-    rotation: Floats = second[:, None, None] * (cross @ cross)
-    rotation += first[:, None, None] * cross
-    rotation += _IDENTITY
-    return rotation
-
-
-_IDENTITY = np.eye(3)
-_GENERATORS = np.zeros((3, 9))
-_GENERATORS[[0, 1, 2], [7, 2, 3]] = 1.0
-_GENERATORS[[0, 1, 2], [5, 6, 1]] = -1.0
-"""(3, 9): a rotation vector times this is its cross-product matrix, row by row."""
-
-
-def _image(rotated_mm: Floats, translation_mm: Floats) -> tuple[Floats, Floats]:
-    """Projections (B, 2, J) of rotated points (B, 3, J), and their inverse depths (B, 1, J)."""
-    placed = rotated_mm + translation_mm[:, :, None]
-    inverse = 1.0 / placed[:, 2:]
-    return placed[:, :2] * inverse, inverse
-
-
-def _damped_step(rows: Floats, weight: Floats, damping: Floats) -> tuple[Floats, Floats]:
-    """Solve (JᵀWJ + λ diag) δ = -JᵀWr for the batch; returns δ (B, 6) and the cost rᵀWr (B,).
-
-    ``rows`` (B, 7, 2, J): six of the Jacobian and the residual, so that one product gives JᵀWJ,
-    JᵀWr and rᵀWr.
-    """
-    batch = len(rows)
-    weighted = (rows * weight[..., None, :, :]).reshape(batch, 7, -1)
-    products = rows.reshape(batch, 7, -1) @ np.swapaxes(weighted, 1, 2).copy()
-    normal, gradient = products[:, :6, :6], products[:, :6, 6:]
-    curvature = np.einsum("bii->bi", normal)  # a view
-    # The floor keeps the system solvable when the joints leave a direction undetermined.
-    floor = curvature.max(1, keepdims=True) * (1e-12 * _UNIT_BALANCE)
-    curvature *= 1.0 + damping[:, None]
-    curvature += floor + 1e-300
-    step = np.asarray(-np.linalg.solve(normal, gradient)[..., 0], dtype=np.float64)
-    return step, products[:, 6, 6]
-
-
-_UNIT_BALANCE = np.array([1.0, 1.0, 1.0, 1e-6, 1e-6, 1e-6])
-"""Radians against millimetres: a radian moves a joint by about a metre."""
+@cache
+def _compiled() -> Callable[..., None]:
+    """The loop of resection.cpp. It runs without Python's lock."""
+    try:
+        loop = ctypes.CDLL(str(_COMPILED)).posematch_resect
+    except OSError as error:
+        raise ImportError(
+            f"{_COMPILED} cannot be loaded ({error}); install posematch again: `scripts/setup`, "
+            "or pip, compiles it"
+        ) from error
+    array, number, real = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+    loop.argtypes = [
+        *(number, number, array, array, array, ctypes.c_int, number, real, real, real),
+        *(array, array, array, array),
+    ]
+    loop.restype = None
+    resection: Callable[..., None] = loop
+    return resection
 
 
 def _nearest_depth(rotated_mm: Floats) -> Floats:
     """Least root depth at which every joint is in front of the camera, with some margin."""
-    extent: Floats = _NEAREST_TO_EXTENT * np.maximum(-rotated_mm[..., 2, :].min(-1), 50.0)
+    behind = np.maximum(-rotated_mm[..., 2, :].min(-1), _LEAST_EXTENT_MM)
+    extent: Floats = _NEAREST_TO_EXTENT * behind
     return extent

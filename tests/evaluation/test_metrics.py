@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from app.lifting.resection import rotation_exponential
 from evaluation.metrics import (
     Floats,
     align,
@@ -11,6 +10,7 @@ from evaluation.metrics import (
     summarise,
 )
 from models.pck import correct_keypoints, torso_px
+from tests.rotations import rotation_exponential
 
 RNG = np.random.default_rng(4)
 TRUTH = RNG.normal(size=(30, 14, 3)) * 400

@@ -3,13 +3,9 @@ import numpy as np
 import pytest
 
 from app.lifting.geometry import Floats, normalised_projection
-from app.lifting.resection import (
-    initial_translation,
-    projection_jacobian,
-    resect,
-    rotation_exponential,
-)
+from app.lifting.resection import initial_translation, resect
 from library_store.library import Library
+from tests.rotations import rotation_exponential
 
 RNG = np.random.default_rng(1)
 FOCAL_PX = 1150.0
@@ -96,23 +92,6 @@ def test_agrees_with_opencv_on_noisy_cases(poses: Floats) -> None:
     assert np.mean(np.abs(ratio - 1) < 1e-4) > 0.97
 
 
-def test_jacobian_matches_finite_differences(poses: Floats) -> None:
-    rotations, translations = random_cameras(len(poses))
-    rotated = poses @ np.swapaxes(rotations, 1, 2)
-    jacobian = projection_jacobian(rotated, translations)
-    for parameter in range(6):
-        step = 1e-5 if parameter < 3 else 1e-2
-        delta = np.zeros((len(poses), 6))
-        delta[:, parameter] = step
-
-        def moved(sign: float, delta: Floats = delta) -> Floats:
-            turned = rotation_exponential(sign * delta[:, :3]) @ rotations
-            return see(poses, turned, translations + sign * delta[:, 3:])
-
-        numeric = np.swapaxes(moved(1.0) - moved(-1.0), 1, 2) / (2 * step)
-        np.testing.assert_allclose(jacobian[:, parameter], numeric, rtol=1e-4, atol=1e-8)
-
-
 def test_a_batch_is_the_same_as_one_by_one(poses: Floats) -> None:
     rotations, translations = random_cameras(24)
     targets = see(poses[:24], rotations, translations) + RNG.normal(size=(24, 14, 2)) * 0.003
@@ -131,6 +110,44 @@ def test_a_batch_is_the_same_as_one_by_one(poses: Floats) -> None:
         np.testing.assert_allclose(
             batch.translation_mm[divmod(i, 6)], single.translation_mm, rtol=1e-9, atol=1e-6
         )
+
+
+def test_what_is_found_belongs_together(poses: Floats) -> None:
+    """Points and residuals are those of the cameras; nothing given is written to."""
+    rotations, translations = random_cameras(len(poses))
+    targets = see(poses, rotations, translations) + RNG.normal(size=(len(poses), 14, 2)) * 0.003
+    start = nudge(rotations)
+    given = [array.copy() for array in (poses, start, targets)]
+    found = resect(poses, start, targets, np.ones(14), iterations=3)
+    for array, before in zip((poses, start, targets), given, strict=True):
+        np.testing.assert_array_equal(array, before)
+    placed = poses @ np.swapaxes(found.rotation, 1, 2) + found.translation_mm[:, None]
+    np.testing.assert_allclose(found.points_mm, placed, rtol=1e-12, atol=1e-6)
+    np.testing.assert_allclose(found.residuals, normalised_projection(placed) - targets, atol=1e-12)
+    product = found.rotation @ np.swapaxes(found.rotation, 1, 2)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-12)
+
+
+def test_no_step_raises_the_cost(poses: Floats) -> None:
+    rotations, _ = random_cameras(len(poses))
+    targets = RNG.normal(size=(len(poses), 14, 2)) * 0.1
+    weights = RNG.uniform(0.2, 1.0, (len(poses), 14))
+    costs = []
+    for iterations in range(8):
+        found = resect(poses, rotations, targets, weights, iterations=iterations)
+        costs.append((weights[..., None] * found.residuals**2).sum((1, 2)))
+    assert (np.diff(costs, axis=0) <= 1e-12 * np.array(costs[:-1])).all()
+    assert np.median(costs[-1] / costs[0]) < 0.9
+
+
+def test_what_does_not_belong_together_is_refused(poses: Floats) -> None:
+    """The compiled loop trusts the shapes."""
+    with pytest.raises(ValueError, match="belong together"):
+        resect(poses[:3], np.eye(3), np.zeros((14, 2)), np.ones(14))
+    with pytest.raises(ValueError, match="belong together"):
+        resect(poses[:3], np.stack([np.eye(3)] * 3), np.zeros((13, 2)), np.ones(14))
+    with pytest.raises(ValueError, match="belong together"):
+        resect(poses[:3], np.stack([np.eye(3)] * 3), np.zeros((13, 2)), np.ones(13))
 
 
 def test_stays_in_front_of_the_camera_when_the_joints_are_nonsense(poses: Floats) -> None:
