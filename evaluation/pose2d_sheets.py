@@ -30,7 +30,7 @@ def drawn(crop: LabelledCrop, joints_px: Floats) -> Image:
     """The square that the networks saw, with a stick figure; joints that are nan are left out."""
     center, extent = crop.extent_px
     matrix = crop_matrix(center, SCALE * extent, 0.0, CELL_PX)
-    cell = cv2.warpAffine(crop.image, matrix, (CELL_PX, CELL_PX))
+    cell = np.asarray(cv2.warpAffine(crop.image, matrix, (CELL_PX, CELL_PX)), np.uint8)
     at = joints_px @ matrix[:, :2].T + matrix[:, 2]
     for a, b in LSP14.edges:
         if np.isfinite(at[[a, b]]).all():
