@@ -77,7 +77,7 @@ class FusionSettings:
     asymmetry: float = 0.15
     noise_px: tuple[float, ...] = (1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0)
     outlier_prior: float = 0.06
-    ambiguous_mm: float = 110.0
+    ambiguous_mm: float = 85.0
     ambiguous_sigmas: float = 0.5
 
 

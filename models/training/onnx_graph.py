@@ -48,6 +48,10 @@ class GraphWriter:
         self._nodes.append(helper.make_node(operator, inputs, [out], out, **attributes))
         return out
 
+    def nodes(self, operator: str, inputs: list[str], outputs: list[str]) -> None:
+        """Add a node with several outputs, named by the caller."""
+        self._nodes.append(helper.make_node(operator, inputs, outputs, outputs[0]))
+
     def constant(self, value: NDArray[np.generic], name: str = "") -> str:
         """Add an initialiser that is no parameter."""
         name = name or f"constant_{len(self._initializers)}"

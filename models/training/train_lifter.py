@@ -150,6 +150,7 @@ def lifter_card(
         file=f"{name}.onnx",
         sha256="",
         description="Lifter: residual MLP from 14 2D joints to their depths, with uncertainty",
+        precision="int8",
         providers=("cpu",),
         parameters=sum(p.numel() for p in network.parameters()),
         multiply_adds=2 * sum(layers),

@@ -71,7 +71,8 @@ def test_the_graph_says_what_the_network_says(poses: Floats, tmp_path: Path) -> 
         radius = np.sqrt((centred**2).sum() / there.sum())
         depths = 0.5 * radius * (said[0] + said[1][mirror])
         depths -= 0.5 * (depths[8] + depths[11])
-        np.testing.assert_allclose(found.depths, depths, atol=2e-4)
+        # The hidden layers' weights have 7 bits.
+        np.testing.assert_allclose(found.depths, depths, atol=0.05 * np.abs(depths).max())
 
 
 def test_the_loss_is_least_at_the_truth_and_at_honest_deviations(poses: Floats) -> None:
