@@ -11,8 +11,8 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 COMPILED = {
-    "library_store/scan.cpp": "library_store/_scan.so",
-    "app/lifting/resection.cpp": "app/lifting/_resection.so",
+    "library_store/_scan.so": ["library_store/scan.cpp"],
+    "app/lifting/_lifting.so": ["app/lifting/resection.cpp", "app/lifting/ensemble.cpp"],
 }
 FLAGS = ["-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC"]
 
@@ -26,10 +26,11 @@ class CompileLoops(BuildHookInterface):  # type: ignore[type-arg]
         if compiler is None:
             raise SystemExit("a C++ compiler is needed (Debian: apt-get install g++)")
         root = Path(self.root)
-        for source, compiled in COMPILED.items():
+        for compiled, sources in COMPILED.items():
             # In one step, for the file may be in use.
             unfinished = root / f"{compiled}.{os.getpid()}"
-            subprocess.run([compiler, *FLAGS, "-o", unfinished, root / source], check=True)
+            paths = [root / source for source in sources]
+            subprocess.run([compiler, *FLAGS, "-o", unfinished, *paths], check=True)
             unfinished.replace(root / compiled)
             build_data["artifacts"].append(compiled)
         build_data["pure_python"] = False

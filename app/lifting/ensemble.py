@@ -18,10 +18,11 @@ from functools import cache
 
 import numpy as np
 
+from app.lifting.compiled import compiled
 from app.lifting.geometry import Floats, Integers
 from app.lifting.posterior import STANDARD_PX_PER_MM
-from app.lifting.proportions import proportion_directions
-from app.lifting.resection import initial_translation
+from app.lifting.proportions import PROPORTION_DIRECTIONS
+from app.lifting.resection import LEAST_EXTENT_MM, NEAREST_TO_EXTENT
 from app.lifting.stature import stature_mm
 from library_store.skeleton import L_HIP, LSP14, R_HIP, Skeleton
 
@@ -75,22 +76,38 @@ def place_ensemble(
             0 for none.
 
     """
-    # Coordinates before joints: that is how small products are fast.
-    rotated = rotations @ np.swapaxes(exemplars_mm, 1, 2).copy()
-    typical = rotated[:_TYPICAL].mean(0)
-    directions = proportion_directions(typical.T)
-    shaped = typical + proportion_spread * np.swapaxes(directions, 1, 2)
-    posed = np.concatenate([rotated, typical[None], shaped])
-    placed = posed + initial_translation(posed, points, weights)[..., None]
-    depth = placed[:, 2]
-    root_depth = 0.5 * (depth[:, R_HIP] + depth[:, L_HIP])
-    n, n_joints = len(rotated), len(points)
-    px_per_unit = STANDARD_PX_PER_MM * float(np.sort(root_depth[:n])[n // 2])
-    scale = px_per_unit / depth
-    states = np.empty((len(posed), 3 * n_joints))
-    np.multiply(placed[:, 0], scale, out=states[:, 0 : 2 * n_joints : 2])
-    np.multiply(placed[:, 1], scale, out=states[:, 1 : 2 * n_joints : 2])
-    np.subtract(depth / root_depth[:, None], 1.0, out=states[:, 2 * n_joints :])
+    n, n_joints = len(exemplars_mm), len(points)
+    exemplars, turned = _contiguous(exemplars_mm), _contiguous(rotations)
+    directions = proportion_spread * PROPORTION_DIRECTIONS
+    targets, shares = _contiguous(points), _contiguous(weights)
+    if (
+        exemplars.shape != (n, n_joints, 3)
+        or turned.shape != (n, 3, 3)
+        or targets.shape != (n_joints, 2)
+        or shares.shape != (n_joints,)
+        or directions.shape[1:] != (n_joints, n_joints)
+    ):
+        raise ValueError("exemplars, rotations, points and weights do not belong together")
+    states = np.empty((n + 1 + len(directions), 3 * n_joints))
+    root_depth = np.empty(len(states))
+    px_per_unit = compiled().posematch_place(
+        n,
+        n_joints,
+        exemplars.ctypes.data,
+        turned.ctypes.data,
+        targets.ctypes.data,
+        shares.ctypes.data,
+        _TYPICAL,
+        len(directions),
+        directions.ctypes.data,
+        R_HIP,
+        L_HIP,
+        NEAREST_TO_EXTENT,
+        LEAST_EXTENT_MM,
+        STANDARD_PX_PER_MM,
+        states.ctypes.data,
+        root_depth.ctypes.data,
+    )
     return Ensemble(
         states=states[:n],
         root_depth_mm=root_depth[:n],
@@ -123,27 +140,38 @@ def local_prior(
         localisation_bones: bones over which a covariance between joints fades to 1/e.
 
     """
-    residual = ensemble.states[:, rows] - observed[rows]
-    squared = np.einsum("kr,kr->k", residual, residual)
-    if len(ensemble.proportions):
-        # Woodbury: the distance in the metric of bandwidth² I + Gᵀ G.
-        explained = ensemble.proportions[:, rows] / bandwidth_px
-        inner = np.eye(len(explained)) + explained @ explained.T
-        reach = residual @ explained.T
-        squared -= np.einsum("kd,kd->k", reach @ np.linalg.inv(inner), reach)
-    # Per coordinate; two coordinates a joint less the translation and scale already fitted.
-    nearest = squared.min() / max(len(rows) - 4, 1)
-    variance = bandwidth_px**2 + adaptive * nearest
-    weights = np.exp(-0.5 * (squared - squared.min()) / variance)
-    weights /= weights.sum()
-
-    mean = weights @ ensemble.states
-    anomalies = np.sqrt(weights)[:, None] * (ensemble.states - mean)
-    covariance = _state_factors(localisation_bones) * (anomalies.T @ anomalies)
-    covariance += ensemble.proportions.T @ ensemble.proportions
+    states, proportions = _contiguous(ensemble.states), _contiguous(ensemble.proportions)
+    seen, wanted = np.ascontiguousarray(rows, dtype=np.int64), _contiguous(observed)
+    factors = _state_factors(localisation_bones)
+    size = states.shape[1]
+    if proportions.shape[1:] != (size,) or factors.shape != (size, size) or not len(states):
+        raise ValueError("the states are not those of these joints")
+    if len(seen) and not 0 <= seen.min() <= seen.max() < min(size, len(wanted)):
+        raise ValueError("rows are observed that no state has")
+    weights, mean, covariance = np.empty(len(states)), np.empty(size), np.empty((size, size))
+    compiled().posematch_local_prior(
+        len(states),
+        size,
+        states.ctypes.data,
+        len(seen),
+        seen.ctypes.data,
+        wanted.ctypes.data,
+        len(proportions),
+        proportions.ctypes.data,
+        bandwidth_px,
+        adaptive,
+        factors.ctypes.data,
+        weights.ctypes.data,
+        mean.ctypes.data,
+        covariance.ctypes.data,
+    )
     image = np.arange(2 * LSP14.n_joints)
     covariance[image, image] += granularity_px**2
     return LocalPrior(mean, covariance, float(weights @ ensemble.root_depth_mm))
+
+
+def _contiguous(values: Floats) -> Floats:
+    return np.ascontiguousarray(values, dtype=np.float64)
 
 
 @cache

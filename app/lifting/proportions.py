@@ -58,16 +58,9 @@ def _directions() -> Floats:
     return directions
 
 
-_DIRECTIONS = _directions()
-
-
-def proportion_directions(poses_mm: Floats) -> Floats:
-    """How a root-centred pose (J, 3) moves with its proportions: (7, J, 3) mm a unit of log length.
-
-    Lengths are equal on both sides; the directions are those that keep the standing height.
-    """
-    return _DIRECTIONS @ poses_mm
-
+PROPORTION_DIRECTIONS = _directions()
+"""(7, J, J): times a root-centred pose (J, 3), how it moves with its proportions, mm a unit of log
+length. Lengths are equal on both sides; the directions are those that keep the standing height."""
 
 Segment = tuple[int, int]
 

@@ -8,7 +8,11 @@
 #include <cstdint>
 #include <vector>
 
+#include "translation.hpp"
+
 namespace {
+
+using posematch::Nearest;
 
 constexpr double kInitialDamping = 1e-4;
 // Radians against millimetres: a radian moves a joint by about a metre.
@@ -22,26 +26,24 @@ struct Camera {
 class Problem {
    public:
     Problem(int64_t n, const double* points, const double* targets, const double* weights,
-            double robust_scale, double nearest_to_extent, double least_extent)
+            double robust_scale, Nearest nearest)
         : n_(n), points_(points), targets_(targets), base_(weights), robust_scale_(robust_scale),
-          nearest_to_extent_(nearest_to_extent), least_extent_(least_extent), weights_(n) {}
+          nearest_(nearest), weights_(n) {}
 
     // Place the exemplar by a camera: joints (J, 3) in its frame, and residuals (J, 2). Returns
     // whether the root is as far away as it has to be.
     bool place(const Camera& camera, double* placed, double* residuals) const {
-        const double *r = camera.rotation, *t = camera.translation;
-        double nearest = 0.0;
+        const double* t = camera.translation;
+        double forward = 0.0;
+        posematch::turn(n_, camera.rotation, points_, placed);
         for (int64_t j = 0; j < n_; ++j) {
-            const double* p = points_ + 3 * j;
             double* q = placed + 3 * j;
-            for (int i = 0; i < 3; ++i)
-                q[i] = r[3 * i] * p[0] + r[3 * i + 1] * p[1] + r[3 * i + 2] * p[2];
-            nearest = std::min(nearest, q[2]);
+            forward = std::min(forward, q[2]);
             for (int i = 0; i < 3; ++i) q[i] += t[i];
             residuals[2 * j] = q[0] / q[2] - targets_[2 * j];
             residuals[2 * j + 1] = q[1] / q[2] - targets_[2 * j + 1];
         }
-        return t[2] >= nearest_to_extent_ * std::max(-nearest, least_extent_);
+        return t[2] >= nearest_.depth(forward);
     }
 
     // The weights of the next step: Cauchy's where a robust scale is given.
@@ -121,7 +123,8 @@ class Problem {
 
     const int64_t n_;
     const double *points_, *targets_, *base_;
-    const double robust_scale_, nearest_to_extent_, least_extent_;
+    const double robust_scale_;
+    const Nearest nearest_;
     std::vector<double> weights_;
 };
 
@@ -151,22 +154,28 @@ Camera moved(const Camera& camera, const double* delta) {
 
 }  // namespace
 
-// `rotation` (B, 3, 3) and `translation` (B, 3) are where the search starts, and what is found;
+// Cameras, `rotation` (B, 3, 3) and `translation` (B, 3), of exemplars (B, J, 3) from rotations
+// (B, 3, 3), where the search starts; the exemplars placed by them and the residuals (B, J, 2).
 // `targets` (B, J, 2) and `weights` (B, J), or one of each for all.
 extern "C" void posematch_resect(int64_t batch, int64_t n_joints, const double* points,
-                                 const double* targets, const double* weights, int shared,
-                                 int64_t iterations, double robust_scale, double nearest_to_extent,
-                                 double least_extent, double* rotation, double* translation,
-                                 double* placed, double* residuals) {
+                                 const double* start, const double* targets, const double* weights,
+                                 int shared, int64_t iterations, double robust_scale,
+                                 double nearest_to_extent, double least_extent, double* rotation,
+                                 double* translation, double* placed, double* residuals) {
+    const Nearest nearest = {nearest_to_extent, least_extent};
+    std::vector<posematch::Translation> first;
     std::vector<double> new_placed(3 * n_joints), new_residuals(2 * n_joints);
     for (int64_t b = 0; b < batch; ++b) {
         const int64_t at = shared ? 0 : b * n_joints;
-        Problem problem(n_joints, points + 3 * b * n_joints, targets + 2 * at, weights + at,
-                        robust_scale, nearest_to_extent, least_extent);
-        Camera camera;
-        std::copy_n(rotation + 9 * b, 9, camera.rotation);
-        std::copy_n(translation + 3 * b, 3, camera.translation);
+        const double* exemplar = points + 3 * b * n_joints;
         double *now = placed + 3 * b * n_joints, *off = residuals + 2 * b * n_joints;
+        if (b == 0 || !shared)
+            first.assign(1, {n_joints, targets + 2 * at, weights + at, nearest});
+        Problem problem(n_joints, exemplar, targets + 2 * at, weights + at, robust_scale, nearest);
+        Camera camera;
+        std::copy_n(start + 9 * b, 9, camera.rotation);
+        posematch::turn(n_joints, camera.rotation, exemplar, now);
+        first[0].of(now, camera.translation);
         problem.place(camera, now, off);
         double damping = kInitialDamping;
         for (int64_t i = 0; i < iterations; ++i) {

@@ -1,6 +1,6 @@
 import numpy as np
 
-from app.lifting.proportions import asymmetry, proportion_directions
+from app.lifting.proportions import PROPORTION_DIRECTIONS, asymmetry
 from app.lifting.stature import stature_mm
 from library_store.anatomy import measure_lengths
 from library_store.library import Library
@@ -9,7 +9,7 @@ from library_store.library import Library
 def test_directions_change_lengths_and_neither_angles_nor_stature(library: Library) -> None:
     pose = library.poses_mm(17)
     lengths = measure_lengths(pose)
-    for direction in proportion_directions(pose):
+    for direction in PROPORTION_DIRECTIONS @ pose:
         moved = pose + 1e-3 * direction
         assert abs(stature_mm(moved) / stature_mm(pose) - 1.0) < 2e-5
         for start, end in ((1, 0), (2, 3), (3, 4), (9, 10), (12, 13)):
@@ -20,7 +20,7 @@ def test_directions_change_lengths_and_neither_angles_nor_stature(library: Libra
     moved_lengths = np.stack(
         [
             np.log(measure_lengths(pose + 1e-4 * direction) / lengths) / 1e-4
-            for direction in proportion_directions(pose)
+            for direction in PROPORTION_DIRECTIONS @ pose
         ]
     )
     # Seven independent directions of unit spread.

@@ -1,0 +1,42 @@
+"""The loops of lifting that are compiled: resection.cpp and ensemble.cpp.
+
+They trust the shapes that they are told, so only the modules that check them call them. They run
+without Python's lock.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from pathlib import Path
+
+_FILE = Path(__file__).with_name("_lifting.so")
+
+
+@cache
+def compiled() -> ctypes.CDLL:
+    """The library of the loops; ``ImportError`` when it was not compiled."""
+    try:
+        library = ctypes.CDLL(str(_FILE))
+    except OSError as error:
+        raise ImportError(
+            f"{_FILE} cannot be loaded ({error}); install posematch again: `scripts/setup`, or "
+            "pip, compiles it"
+        ) from error
+    array, number, real = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+    library.posematch_resect.argtypes = [
+        *(number, number, array, array, array, array, ctypes.c_int),
+        *(number, real, real, real, array, array, array, array),
+    ]
+    library.posematch_resect.restype = None
+    library.posematch_place.argtypes = [
+        *(number, number, array, array, array, array),
+        *(number, number, array, number, number, real, real, real, array, array),
+    ]
+    library.posematch_place.restype = real
+    library.posematch_local_prior.argtypes = [
+        *(number, number, array, number, array, array),
+        *(number, array, real, real, array, array, array, array),
+    ]
+    library.posematch_local_prior.restype = None
+    return library
