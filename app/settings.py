@@ -176,7 +176,10 @@ class Settings(BaseSettings):
     @classmethod
     def _split_commas(cls, value: Any) -> Any:
         if isinstance(value, str):
-            return tuple(part.strip() for part in value.split(",") if part.strip())
+            parts = tuple(part.strip() for part in value.split(",") if part.strip())
+            if value.strip() and not parts:  # keys that are none would leave the door open
+                raise ValueError("lists nothing, but commas")
+            return parts
         return value
 
     @field_validator("api_keys")
@@ -198,13 +201,19 @@ class Settings(BaseSettings):
     @model_validator(mode="after")
     def _fit_together(self) -> Self:
         if self.index == "milvus" and self.milvus_uri is None:
-            raise ValueError("index=milvus needs milvus_uri")
+            raise ValueError("POSEMATCH_INDEX=milvus needs POSEMATCH_MILVUS_URI")
         if self.quota_per_minute is not None and not self.api_keys:
-            raise ValueError("quota_per_minute counts per API key: set api_keys too")
+            raise ValueError(
+                "POSEMATCH_QUOTA_PER_MINUTE counts per API key: set POSEMATCH_API_KEYS too"
+            )
         if self.max_batch_body_bytes < self.max_body_bytes:
-            raise ValueError("max_batch_body_bytes is smaller than max_body_bytes")
+            raise ValueError(
+                "POSEMATCH_MAX_BATCH_BODY_BYTES is smaller than POSEMATCH_MAX_BODY_BYTES"
+            )
         if self.upload_memory_bytes < self.max_batch_body_bytes:
-            raise ValueError("upload_memory_bytes is smaller than max_batch_body_bytes")
+            raise ValueError(
+                "POSEMATCH_UPLOAD_MEMORY_BYTES is smaller than POSEMATCH_MAX_BATCH_BODY_BYTES"
+            )
         return self
 
 

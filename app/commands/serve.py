@@ -56,7 +56,13 @@ def serve(
             timeout_graceful_shutdown=settings.shutdown_grace_s,
         )
     )
-    with suppress(KeyboardInterrupt):  # uvicorn shuts down in order, then raises it again
-        server.run()
+    try:
+        with suppress(KeyboardInterrupt):  # uvicorn shuts down in order, then raises it again
+            server.run()
+    except SystemExit:  # its word for an address that is taken or that is none; the log says which
+        raise StartupError(
+            f"cannot listen on {settings.host} port {settings.port}; free it, or choose another "
+            "with POSEMATCH_HOST and POSEMATCH_PORT"
+        ) from None
     if app.state.service.startup_error is not None:
         raise app.state.service.startup_error

@@ -55,6 +55,7 @@ def test_unknown_settings_are_refused_with_a_hint(monkeypatch: pytest.MonkeyPatc
         ("MAX_PIXELS", "1000000000000"),
         ("MAX_BODY_BYTES", "100000000"),
         ("API_KEYS", "short"),
+        ("API_KEYS", " , "),
         ("CORS_ORIGINS", "example.org"),
         ("CORS_ORIGINS", "https://example.org/path"),
         ("QUOTA_PER_MINUTE", "10"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import shutil
+import socket
 import subprocess
 import threading
 import time
@@ -20,10 +21,10 @@ from models.card import WEIGHTS_DIR
 from tests.app.server import COMMAND, Server, environment
 
 
-def refusal(tmp_path: Path, **settings: object) -> str:
+def refusal(tmp_path: Path, port: int = 0, **settings: object) -> str:
     """What `posematch serve` says on stderr when it refuses to start."""
     outcome = subprocess.run(
-        [COMMAND, "serve", "--port", "0"],
+        [COMMAND, "serve", "--port", str(port)],
         env=environment(**{"cache_dir": tmp_path / "cache", **settings}),
         capture_output=True,
         text=True,
@@ -39,6 +40,14 @@ def refusal(tmp_path: Path, **settings: object) -> str:
 def test_bad_settings(tmp_path: Path) -> None:
     assert "POSEMATCH_WORKERS" in refusal(tmp_path, workers=0)
     assert "POSEMATCH_WORKERS" in refusal(tmp_path, worker=1), "a hint at the right name"
+
+
+def test_an_address_that_is_taken(tmp_path: Path, library_dir: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        said = refusal(tmp_path, port, library_dir=library_dir)
+    assert f"127.0.0.1 port {port}" in said
+    assert "POSEMATCH_PORT" in said
 
 
 def test_missing_library(tmp_path: Path) -> None:
