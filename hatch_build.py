@@ -12,7 +12,11 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 COMPILED = {
     "library_store/_scan.so": ["library_store/scan.cpp"],
-    "app/lifting/_lifting.so": ["app/lifting/resection.cpp", "app/lifting/ensemble.cpp"],
+    "app/lifting/_lifting.so": [
+        "app/lifting/resection.cpp",
+        "app/lifting/ensemble.cpp",
+        "app/lifting/evidence.cpp",
+    ],
 }
 FLAGS = ["-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC"]
 

@@ -1,4 +1,4 @@
-"""The loops of lifting that are compiled: resection.cpp and ensemble.cpp.
+"""The loops of lifting that are compiled: resection, ensemble and evidence.cpp.
 
 They trust the shapes that they are told, so only the modules that check them call them. They run
 without Python's lock.
@@ -39,4 +39,8 @@ def compiled() -> ctypes.CDLL:
         *(number, array, real, real, array, array, array, array),
     ]
     library.posematch_local_prior.restype = None
+    library.posematch_evidence.argtypes = [
+        *(number, number, array, array, array, real, array, array, array),
+    ]
+    library.posematch_evidence.restype = None
     return library

@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "translation.hpp"
+#include "wide.hpp"
 
 namespace {
 
@@ -83,11 +84,10 @@ extern "C" double posematch_place(int64_t n, int64_t n_joints, const double* exe
 
 // Weights (n,), mean (S,) and covariance (S, S) of states (n, S) about an observation at `rows`.
 // `proportions` (D, S); `factors` (S, S) what covariances are multiplied by.
-extern "C" void posematch_local_prior(int64_t n, int64_t size, const double* states, int64_t n_rows,
-                                      const int64_t* rows, const double* observed,
-                                      int64_t n_proportions, const double* proportions,
-                                      double bandwidth, double adaptive, const double* factors,
-                                      double* weights, double* mean, double* covariance) {
+extern "C" WIDE void posematch_local_prior(
+    int64_t n, int64_t size, const double* states, int64_t n_rows, const int64_t* rows,
+    const double* observed, int64_t n_proportions, const double* proportions, double bandwidth,
+    double adaptive, const double* factors, double* weights, double* mean, double* covariance) {
     // Woodbury: the distance in the metric of bandwidth² I + Gᵀ G.
     const int64_t d = n_proportions;
     std::vector<double> explained(n_rows * d), inner(d * d), reach(d);
@@ -129,13 +129,23 @@ extern "C" void posematch_local_prior(int64_t n, int64_t size, const double* sta
         for (int64_t i = 0; i < size; ++i) mean[i] += weights[k] * states[k * size + i];
     }
     std::fill_n(covariance, size * size, 0.0);
-    std::vector<double> anomaly(size);
-    for (int64_t k = 0; k < n; ++k) {
-        for (int64_t i = 0; i < size; ++i) anomaly[i] = states[k * size + i] - mean[i];
+    // Four states at once, so that sums are fetched and put back a quarter as often.
+    std::vector<double> anomalies(4 * size);
+    const double *first = &anomalies[0], *second = first + size, *third = second + size,
+                 *fourth = third + size;
+    for (int64_t k = 0; k < n; k += 4) {
+        double share[4] = {};
+        for (int64_t m = 0; m < std::min<int64_t>(4, n - k); ++m) {
+            share[m] = weights[k + m];
+            for (int64_t i = 0; i < size; ++i)
+                anomalies[m * size + i] = states[(k + m) * size + i] - mean[i];
+        }
         for (int64_t i = 0; i < size; ++i) {
-            const double weighted = weights[k] * anomaly[i];
+            const double one = share[0] * first[i], two = share[1] * second[i];
+            const double three = share[2] * third[i], four = share[3] * fourth[i];
             double* __restrict row = covariance + i * size;
-            for (int64_t j = 0; j <= i; ++j) row[j] += weighted * anomaly[j];
+            for (int64_t j = 0; j <= i; ++j)
+                row[j] += (one * first[j] + two * second[j]) + (three * third[j] + four * fourth[j]);
         }
     }
     for (int64_t i = 0; i < size; ++i)
