@@ -29,6 +29,10 @@ Backend = Literal["auto", "cells", "exact", "hnsw", "milvus"]
 
 DESCRIPTORS_FILE = "descriptors.npy"
 
+GRAPH_UP_TO = 1_000_000
+"""Exemplars for which a graph is built unless told otherwise: beyond, the cells answer as soon, and
+a graph takes them ten times as long to build."""
+
 
 @dataclass(frozen=True)
 class IndexSettings:
@@ -41,6 +45,12 @@ class IndexSettings:
     def files(self) -> tuple[str, ...]:
         """The files it is made of."""
         return (*CELL_FILES, HNSW_FILE) if self.hnsw else CELL_FILES
+
+
+def index_settings(n: int, graph: bool | None = None) -> IndexSettings:
+    """What ``n`` exemplars are indexed with: with a ``graph`` or not, ``None`` as their number."""
+    wanted = n <= GRAPH_UP_TO if graph is None else graph
+    return IndexSettings(hnsw=HnswSettings() if wanted else None)
 
 
 def write_index(

@@ -37,8 +37,8 @@ Progress = Callable[[str, float], None]
 RECIPE = 2
 """Raised whenever the code would build another library from the same parameters."""
 
-BYTES_PER_EXEMPLAR = 450
-"""About what an exemplar takes on the disk, its share of the index included."""
+BYTES_PER_EXEMPLAR = 620
+"""About what an exemplar takes on the disk, its share of cells and graph included."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from rich.table import Table
 from app.commands.console import build_if_missing, notices, output, stage_progress
 from app.engine import milvus_of
 from app.settings import load_settings
-from library_store.backends import IndexSettings
+from library_store.backends import index_settings
 from library_store.build import (
     BuildSettings,
     Mocap,
@@ -24,7 +24,6 @@ from library_store.build import (
     describe_library,
     verify_library,
 )
-from library_store.hnsw import HnswSettings
 from library_store.importers import Clip, read_each, states_licence, write_npz
 from library_store.library import load
 from library_store.manifest import Manifest
@@ -45,8 +44,13 @@ LibraryArgument = Annotated[
 ]
 
 HnswOption = Annotated[
-    bool,
-    typer.Option(help="Index with an HNSW graph; without it the cells serve complete poses too."),
+    bool | None,
+    typer.Option(
+        "--hnsw/--no-hnsw",
+        help="Index with an HNSW graph; default up to a million exemplars. Without it the cells "
+        "serve complete poses too.",
+        show_default=False,
+    ),
 ]
 
 
@@ -95,7 +99,7 @@ def build(
     name: Annotated[str, typer.Option(help="In exemplar ids; default the directory's.")] = "",
     version: Annotated[str, typer.Option(help="Default the prior's, or 1.")] = "",
     seed: Annotated[int, typer.Option(min=0, help="Another seed gives other poses.")] = 0,
-    hnsw: HnswOption = True,
+    hnsw: HnswOption = None,
 ) -> None:
     """Build a library from clips, from a pose prior or both.
 
@@ -118,7 +122,7 @@ def build(
             cameras_per_pose=cameras_per_pose,
             seed=seed,
             version=version,
-            index=_index(hnsw),
+            index=index_settings(size, hnsw),
         )
     except ValueError as error:
         raise typer.BadParameter(str(error), param_hint="--name") from error
@@ -153,10 +157,6 @@ def _prior(choice: str | None, mocap: Mocap | None) -> PosePrior | None:
     return PosePrior.load(DEFAULT_PRIOR if choice == "default" else Path(choice))
 
 
-def _index(hnsw: bool) -> IndexSettings:
-    return IndexSettings(hnsw=HnswSettings() if hnsw else None)
-
-
 def _ask_for_licence(files: list[Path]) -> str:
     """What somebody at a terminal says about files that state no licence."""
     unstated = [file.name for file in files if not states_licence(file)]
@@ -174,9 +174,10 @@ def merge(
     directory: Annotated[Path, typer.Option(help="Write the merged library here.")],
     name: Annotated[str, typer.Option(help="In exemplar ids; default the directory's.")] = "",
     version: Annotated[str, typer.Option(help="The new library's.")] = "1",
-    hnsw: HnswOption = True,
+    hnsw: HnswOption = None,
 ) -> None:
     """Make one library of several, without building their parts anew."""
+    size = sum(describe_library(library).n_exemplars for library in libraries)
     try:
         with stage_progress() as report:
             manifest = merge_libraries(
@@ -184,7 +185,7 @@ def merge(
                 libraries,
                 name=name or directory.name,
                 version=version,
-                index=_index(hnsw),
+                index=index_settings(size, hnsw),
                 progress=report,
             )
     except ValueError as error:

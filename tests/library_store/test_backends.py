@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from library_store.backends import Backend, IndexSettings
+from library_store.backends import GRAPH_UP_TO, Backend, IndexSettings, index_settings
 from library_store.build import BuildSettings, build_library, verify_library
 from library_store.errors import LibraryError
 from library_store.hnsw import HNSW_FILE, HnswSettings
@@ -62,6 +62,13 @@ def test_a_graph_that_was_not_built_is_not_searched(prior: PosePrior, tmp_path: 
     load(plain).close()
     with pytest.raises(LibraryError, match=r"--no-hnsw.*POSEMATCH_INDEX=auto"):
         load(plain, backend="hnsw")
+
+
+def test_a_graph_is_built_where_it_is_worth_it() -> None:
+    assert index_settings(200_000).hnsw == index_settings(GRAPH_UP_TO).hnsw == HnswSettings()
+    assert index_settings(GRAPH_UP_TO + 1).hnsw is None
+    assert index_settings(GRAPH_UP_TO + 1, graph=True).hnsw == HnswSettings()
+    assert index_settings(1, graph=False).hnsw is None
 
 
 def test_milvus_must_be_somewhere(small_directory: Path) -> None:
