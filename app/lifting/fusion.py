@@ -29,7 +29,7 @@ import numpy as np
 from app.lifting.ensemble import Ensemble, LocalPrior, local_prior
 from app.lifting.evidence import Evidence
 from app.lifting.geometry import Floats, lift_to_depth
-from app.lifting.learned import with_learned
+from app.lifting.learned import misplaced, with_learned
 from app.lifting.posterior import STANDARD_PX_PER_MM
 from app.lifting.proportions import asymmetry
 from app.lifting.stature import expected_stature_mm
@@ -148,11 +148,14 @@ def fuse(
     posterior = _made_symmetric(posterior, ensemble.px_per_unit, settings.asymmetry)
     posterior = _made_as_tall(posterior, ensemble.px_per_unit, ensemble.stature_mm)
     suspect = evidence.suspect(confidence[seen], settings.outlier_prior)
+    outlier = None if suspect is None else int(seen[suspect])
+    if outlier is None and learned is not None:
+        outlier = misplaced(learned, points, confidence, ensemble.px_per_unit)
     return FusedPose(
         joints_mm=_joints(posterior, ensemble.px_per_unit),
         spread_mm=_spread_about_root(posterior),
         noise_px=float(np.sqrt(evidence.mean_noise_var)),
-        outlier=None if suspect is None else int(seen[suspect]),
+        outlier=outlier,
         ambiguous=_is_ambiguous(posterior, settings),
     )
 

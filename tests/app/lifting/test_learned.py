@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from app.lifting.ensemble import LocalPrior
-from app.lifting.learned import with_learned
+from app.lifting.learned import misplaced, with_learned
 from app.lifting.lifter import Lifter, LiftingSettings
 from evaluation.metrics import rigid_error_mm
 from library_store.library import Library
@@ -79,3 +79,24 @@ def test_the_papers_method_does_not_ask_it(lifter: Lifter, both: Lifter, people:
         lift_one(one, people.observation(1), method="paper").joints_3d_mm for one in (lifter, both)
     ]
     np.testing.assert_array_equal(answers[0], answers[1])
+
+
+def test_a_joint_that_lies_far_from_where_the_network_puts_it_is_found(people: People) -> None:
+    network, found, wrongly = PoseLifter(), 0, 0
+    for index in range(20):
+        points = (people.joints_px[index] - people.joints_px[index].mean(0)) / 1150.0
+        joint = (4, 7, 10, 13)[index % 4]
+        clean = network.lift(points, np.ones(14))
+        wrongly += misplaced(clean, points, np.ones(14), PX_PER_UNIT) is not None
+        moved = points.copy()
+        # Outwards: what makes a limb shorter may as well be a bent one.
+        outwards = points[joint] - points[joint - 2]
+        moved[joint] += np.linalg.norm(points[1] - points[8]) * outwards / np.linalg.norm(outwards)
+        said = network.lift(moved, np.ones(14))
+        found += misplaced(said, moved, np.ones(14), PX_PER_UNIT) == joint
+        confidence = np.ones(14)
+        confidence[joint] = 0.0
+        without = network.lift(moved, confidence)
+        assert misplaced(without, moved, confidence, PX_PER_UNIT) != joint
+    assert found >= 10
+    assert wrongly <= 3
