@@ -25,7 +25,7 @@ from rich.progress import track
 from app.engine import chosen_networks
 from app.settings import load_settings
 from models import PersonBox, PersonDetector, PoseEstimator
-from models.person_detector import Floats, iou
+from models.person_detector import Floats, corners, iou
 from models.presence import present
 from models.training.dataset import Image, decode_members, held_out, load
 from models.training.scenes import mosaic
@@ -71,12 +71,6 @@ class Counts:
             f"| {name} | {self.scenes} | {self.wanted} | {recall} | {precision} "
             f"| {self.duplicates} | {self.strange / self.scenes:.3f} |"
         )
-
-
-def corners(boxes: list[PersonBox]) -> Floats:
-    """(n, 4) x0, y0, x1, y1."""
-    rows = [(b.x_px, b.y_px, b.x_px + b.width_px, b.y_px + b.height_px) for b in boxes]
-    return np.array(rows, np.float64).reshape(-1, 4)
 
 
 def count(find: Find, scenes: list[Scene], label: str) -> Counts:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +31,12 @@ class PersonBox:
     width_px: float
     height_px: float
     score: float
+
+
+def corners(boxes: Sequence[PersonBox]) -> Floats:
+    """(n, 4) x0, y0, x1, y1."""
+    rows = [(b.x_px, b.y_px, b.x_px + b.width_px, b.y_px + b.height_px) for b in boxes]
+    return np.array(rows, np.float64).reshape(-1, 4)
 
 
 def iou(a: Floats, b: Floats) -> Floats:

@@ -15,7 +15,7 @@ import numpy as np
 
 from models.card import WEIGHTS_DIR, read_card, write_card
 from models.cost import cpu_ms
-from models.person_detector import PersonDetector, iou
+from models.person_detector import PersonDetector, corners, iou
 from models.session import OnnxModel
 from models.training.dataset import Image, decode_members
 from models.training.train_people import DEV_ONE_IN
@@ -32,12 +32,7 @@ def recall_and_extra(
     """Share of the sure teacher boxes (x0, y0, x1, y1, score) found; strange boxes a scene."""
     found = wanted = extra = 0
     for image, people in scenes:
-        boxes = np.array(
-            [
-                (b.x_px, b.y_px, b.x_px + b.width_px, b.y_px + b.height_px)
-                for b in detector.detect(image, 100)
-            ]
-        ).reshape(-1, 4)
+        boxes = corners(detector.detect(image, 100))
         sure = people[people[:, 4] >= SURE, :4]
         found += int((iou(boxes, sure).max(0, initial=0) > SAME).sum())
         wanted += len(sure)
