@@ -25,7 +25,9 @@ from app.errors import OverloadedError, PoseMatchError
 T = TypeVar("T")
 
 _MEMORY = 0.1
-"""Weight of the newest duration in the running mean of a kind of work."""
+"""Weight of the newest duration in what a kind of work usually takes."""
+_DEVIATIONS = 4.0
+"""Work counts as lasting so many mean deviations longer than usual when it has to end in time."""
 
 
 class ClientGoneError(PoseMatchError):
@@ -41,6 +43,25 @@ class Arrival:
 
     at_s: float
     gone: asyncio.Future[None]
+
+
+@dataclass
+class _Usual:
+    """How long a kind of work takes: running mean and mean deviation, as TCP does (RFC 6298)."""
+
+    mean_s: float = 0.0
+    deviation_s: float = 0.0
+
+    @property
+    def at_most_s(self) -> float:
+        """Nearly always enough."""
+        return self.mean_s + _DEVIATIONS * self.deviation_s
+
+    def learn(self, spent_s: float) -> None:
+        """Take one more duration into account."""
+        off_s = spent_s - self.mean_s
+        self.mean_s += _MEMORY * off_s
+        self.deviation_s += _MEMORY * (abs(off_s) - self.deviation_s)
 
 
 @dataclass(eq=False)
@@ -60,7 +81,7 @@ class Admission:
         self._queue_size = queue_size
         self._deadline_s = deadline_s
         self._jobs: dict[Future[Any], _Job] = {}
-        self._mean_s: dict[str, float] = {}
+        self._usual: dict[str, _Usual] = {}
 
     @property
     def running(self) -> int:
@@ -73,29 +94,29 @@ class Admission:
         return len(self._jobs) - self.running
 
     def expect(self, kind: str, seconds: float) -> None:
-        """Start the running mean of ``kind`` of work at ``seconds`` (a warm-up's figure)."""
-        self._mean_s[kind] = seconds
+        """Say what ``kind`` of work will usually take (a warm-up's figure)."""
+        self._usual[kind] = _Usual(seconds)
 
     def check(self, kind: str) -> None:
         """Raise the ``OverloadedError`` that a request whose body came now would meet, if any."""
         if self.running == self._workers:
-            self._refuse_if_hopeless(self._mean_s.get(kind, 0.0), time.monotonic())
+            self._refuse_if_hopeless(self._usual.get(kind, _Usual()), time.monotonic())
 
     async def run(self, kind: str, work: Callable[[], T], arrival: Arrival, *, units: int = 1) -> T:
         """Run ``work`` on a worker thread and return its result.
 
-        ``kind`` selects the running mean durations are estimated from; ``units`` is how many
-        times the usual work this is (images in a batch).
+        ``kind`` selects what durations are estimated from; ``units`` is how many times the usual
+        work this is (images in a batch).
         Raises ``OverloadedError`` when refused, ``ClientGoneError`` when the client has left
         before its turn.
         """
         if arrival.gone.done():
             raise ClientGoneError
-        unit_s = self._mean_s.get(kind, 0.0)
+        usual = self._usual.get(kind, _Usual())
         wait_s, slack_s = 0.0, None
         if self.running == self._workers:
-            wait_s, slack_s = self._refuse_if_hopeless(unit_s, arrival.at_s)
-        job = _Job(units * unit_s)
+            wait_s, slack_s = self._refuse_if_hopeless(usual, arrival.at_s)
+        job = _Job(units * usual.mean_s)
 
         def begin() -> T:
             job.began_s = time.monotonic()
@@ -147,7 +168,7 @@ class Admission:
             self._jobs.pop(thread, None)
         return withdrawn
 
-    def _refuse_if_hopeless(self, unit_s: float, at_s: float) -> tuple[float, float]:
+    def _refuse_if_hopeless(self, usual: _Usual, at_s: float) -> tuple[float, float]:
         """How long one more request would wait, and how long it may; or ``OverloadedError``."""
         now_s = time.monotonic()
         backlog_s = 0.0
@@ -155,7 +176,7 @@ class Admission:
             spent_s = 0.0 if job.began_s is None else now_s - job.began_s
             backlog_s += max(0.0, job.cost_s - spent_s)
         wait_s = backlog_s / self._workers
-        slack_s = at_s + self._deadline_s - unit_s - now_s
+        slack_s = at_s + self._deadline_s - usual.at_most_s - now_s
         if self.waiting >= self._queue_size:
             raise self._refusal("queue_full", wait_s)
         if wait_s > slack_s:
@@ -167,8 +188,7 @@ class Admission:
         if job is None or job.began_s is None:  # withdrawn
             return
         spent_s = (time.monotonic() - job.began_s) / units
-        mean_s = self._mean_s.get(kind, spent_s)
-        self._mean_s[kind] = mean_s + _MEMORY * (spent_s - mean_s)
+        self._usual.setdefault(kind, _Usual(spent_s)).learn(spent_s)
 
     def _refusal(self, reason: str, wait_s: float) -> OverloadedError:
         return OverloadedError(reason, max(1, math.ceil(wait_s)))

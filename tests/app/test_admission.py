@@ -6,6 +6,7 @@ import asyncio
 import threading
 import time
 from collections.abc import Coroutine
+from functools import partial
 from typing import Any
 
 import pytest
@@ -85,6 +86,30 @@ def test_a_wait_past_the_deadline_is_refused_at_once() -> None:
         done.set()
         await first
         gate.close()
+
+    run(scenario())
+
+
+def test_work_that_may_take_longer_is_accepted_less_far_ahead() -> None:
+    """The same mean; where durations differ, room is left before the deadline."""
+
+    async def accepted(durations_s: list[float]) -> int:
+        gate = admission(queue_size=100, deadline_s=0.5)
+        gate.expect("x", sum(durations_s) / len(durations_s))
+        for duration_s in durations_s * 15:
+            await gate.run("x", partial(time.sleep, duration_s), arrival())
+        done = threading.Event()
+        tasks = [asyncio.create_task(gate.run("x", done.wait, arrival())) for _ in range(60)]
+        await asyncio.sleep(0.01)
+        waiting = gate.waiting
+        done.set()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        gate.close()
+        return waiting
+
+    async def scenario() -> None:
+        steady, uneven = await accepted([0.02, 0.02]), await accepted([0.002, 0.038])
+        assert 0 < uneven < 0.95 * steady
 
     run(scenario())
 
