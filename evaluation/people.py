@@ -28,9 +28,8 @@ from models import PersonBox, PersonDetector, PoseEstimator
 from models.person_detector import Floats, corners, iou
 from models.presence import present
 from models.training.dataset import Image, decode_members, held_out, load
-from models.training.scenes import mosaic
+from models.training.scenes import DEV_ONE_IN, mosaic
 
-HELD_OUT_ONE_IN = 8
 SURE = 0.7
 """Teacher's score from which a box has to be found; surer and unsurer ones excuse a box."""
 SAME, STRANGE = 0.5, 0.3
@@ -95,7 +94,7 @@ def tall(boxes: Floats) -> Floats:
 def teacher_scenes(images: dict[str, Image], labels: Path) -> list[Scene]:
     """Held-out scenes with the teacher's boxes."""
     scenes = []
-    for record in json.loads(labels.read_text())[::HELD_OUT_ONE_IN]:
+    for record in json.loads(labels.read_text())[::DEV_ONE_IN]:
         people = np.array(record["people"], np.float64).reshape(-1, 5)
         sure = tall(people[people[:, 4] >= SURE, :4])
         scenes.append(Scene(images[record["image"]], sure, people[:, :4]))

@@ -128,14 +128,18 @@ class PersonDetector:
             for height, width in {(short, long), (long, short)}:
                 self._model.run(np.zeros((1, height, width, 3), np.uint8))
 
-    def detect(self, image: NDArray[np.uint8], max_people: int) -> list[PersonBox]:
-        """People in a photo (H, W, 3) uint8 BGR, most certain first, at most ``max_people``."""
+    def detect(
+        self, image: NDArray[np.uint8], max_people: int, *, threshold: float | None = None
+    ) -> list[PersonBox]:
+        """People in a photo (H, W, 3) uint8 BGR, most certain first, at most ``max_people``.
+
+        ``threshold`` is the least score, the card's by default.
+        """
         height, width = image.shape[:2]
         canvas, (small_w, small_h) = shrunk(image, self._output.long_side_px)
         maps = self._model.run(canvas[None])[0]
-        boxes, scores = decode(
-            maps, self._output.stride_px, self._output.unit_px, self._output.threshold
-        )
+        least = self._output.threshold if threshold is None else threshold
+        boxes, scores = decode(maps, self._output.stride_px, self._output.unit_px, least)
         ratio = np.array([width / small_w, height / small_h] * 2)
         photo = (boxes + 0.5) * ratio - 0.5
         limit = np.array([width, height] * 2) - 1.0

@@ -18,7 +18,7 @@ from models.cost import cpu_ms
 from models.person_detector import PersonDetector, corners, iou
 from models.session import OnnxModel
 from models.training.dataset import Image, decode_members
-from models.training.train_people import DEV_ONE_IN
+from models.training.scenes import DEV_ONE_IN
 
 SURE = 0.7
 """Teacher's score from which a box has to be found."""

@@ -24,9 +24,8 @@ from models.pose_estimator import PoseEstimator
 from models.presence import belief
 from models.training.crowds import calm_patches
 from models.training.dataset import Image, decode_members, held_out, load
-from models.training.scenes import LabelledScene, mosaic
+from models.training.scenes import DEV_ONE_IN, LabelledScene, mosaic
 
-HELD_OUT_ONE_IN = 8
 SURE, SAME, STRANGE = 0.7, 0.5, 0.3
 MOSAICS, MOSAIC_SIZE = 400, (640, 480)
 THRESHOLDS = np.arange(0.10, 0.52, 0.03)
@@ -67,7 +66,7 @@ def main() -> None:
     scenes = [
         LabelledScene(images[r["image"]], np.array(r["people"], np.float32).reshape(-1, 5))
         for i, r in enumerate(records)
-        if i % HELD_OUT_ONE_IN
+        if i % DEV_ONE_IN
     ]
     somebody: list[float] = []
     for scene in track(scenes, "scenes", transient=True, console=console):

@@ -13,6 +13,8 @@ from models.training.cutout import place
 from models.training.dataset import Image, LabelledCrop
 
 SURE, UNSURE = 0.6, 0.3
+DEV_ONE_IN = 8
+"""One labelled scene in so many is held out from training."""
 
 
 @dataclass(frozen=True)

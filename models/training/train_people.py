@@ -22,10 +22,17 @@ from models.training.crowds import calm_patches, crowd
 from models.training.cutout import whole
 from models.training.dataset import decode_members
 from models.training.network import PersonConfig, PersonNetwork
-from models.training.scenes import UNSURE, LabelledScene, SceneSample, mosaic, portrait, scene_view
+from models.training.scenes import (
+    DEV_ONE_IN,
+    UNSURE,
+    LabelledScene,
+    SceneSample,
+    mosaic,
+    portrait,
+    scene_view,
+)
 from models.training.train import read_crops
 
-DEV_ONE_IN = 8
 UNIT_PX = 32.0
 """Distances to the box's sides are learned as logarithms of multiples of this."""
 
