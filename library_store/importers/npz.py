@@ -78,7 +78,11 @@ def write(path: Path, clips: Sequence[Clip]) -> None:
     The file appears whole or not at all. Raises ``MocapError`` where it cannot be written.
     """
     if not clips:
-        raise MocapError(path, "there are no clips to write")
+        raise MocapError(
+            path,
+            "there are no clips to write: nothing given is motion capture that can be read "
+            "(AMC with its ASF, BVH, C3D, Human3.6M CDF, npz)",
+        )
     lengths = [len(clip) for clip in clips]
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
     try:
