@@ -48,9 +48,13 @@ class IndexSettings:
 
 
 def index_settings(n: int, graph: bool | None = None) -> IndexSettings:
-    """What ``n`` exemplars are indexed with: with a ``graph`` or not, ``None`` as their number."""
+    """What ``n`` exemplars are indexed with: with a ``graph`` or not, ``None`` as their number.
+
+    Beyond 1.8 million cells grow with the root of the number, for every query ranks them all.
+    """
+    rows_per_cell = round(ROWS_PER_CELL * max(1.0, n / 1_800_000.0) ** 0.5)
     wanted = n <= GRAPH_UP_TO if graph is None else graph
-    return IndexSettings(hnsw=HnswSettings() if wanted else None)
+    return IndexSettings(rows_per_cell, hnsw=HnswSettings() if wanted else None)
 
 
 def write_index(

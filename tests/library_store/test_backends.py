@@ -71,6 +71,11 @@ def test_a_graph_is_built_where_it_is_worth_it() -> None:
     assert index_settings(1, graph=False).hnsw is None
 
 
+def test_cells_grow_only_in_very_large_libraries() -> None:
+    assert index_settings(1_800_000).rows_per_cell == index_settings(1).rows_per_cell == 100
+    assert index_settings(64_800_000).rows_per_cell == 600
+
+
 def test_milvus_must_be_somewhere(small_directory: Path) -> None:
     with pytest.raises(LibraryError, match="POSEMATCH_MILVUS_URI"):
         load(small_directory, backend="milvus")
