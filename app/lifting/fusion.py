@@ -55,8 +55,9 @@ class FusionSettings:
 
     Chosen on mocap subjects of whom no table is measured (and who were not in that trial's
     library), except those that came later: ``bandwidth_px``, ``localisation_bones``,
-    ``proportion_spread``, ``asymmetry``, ``outlier_prior`` and ``ambiguous_mm`` on some of the
-    even-numbered people of the tables' sets.
+    ``proportion_spread``, ``asymmetry`` and ``outlier_prior`` on some of the even-numbered people
+    of the tables' sets, ``ambiguous_mm`` on every fifth of the first; and ``doubt``, on frames of
+    the network's own subjects given other proportions.
 
     ``bandwidth_px``, ``adaptive``, ``granularity_px``, ``localisation_bones``: see
     ``ensemble.local_prior``; ``proportion_spread``: see ``ensemble.place_ensemble``;
