@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -112,7 +113,7 @@ def load_engine(settings: Settings) -> Engine:
         raise StartupError(str(error)) from error
     library = _open_library(locate_library(settings), settings)
     pipeline = _assemble(detector, estimator, lifter, library, settings)
-    photo_s = _warm_up(pipeline)
+    photo_s = _warm_up(pipeline, settings.max_pixels)
     return Engine(library, estimator.card, detector, estimator, lifter, pipeline, photo_s)
 
 
@@ -130,7 +131,7 @@ def reload_engine(engine: Engine, settings: Settings) -> Engine | None:
         raise StartupError(str(error)) from error
     library = _open_library(directory, settings)
     pipeline = _assemble(engine.detector, engine.estimator, engine.lifter, library, settings)
-    _warm_up(pipeline)
+    _warm_up(pipeline, settings.max_pixels)
     return replace(engine, library=library, pipeline=pipeline)
 
 
@@ -169,20 +170,24 @@ def _assemble(
     )
 
 
-def _warm_up(pipeline: Pipeline) -> float:
+def _warm_up(pipeline: Pipeline, max_pixels: int) -> float:
     """Run every stage a few times on a made-up photo; returns the fastest run in seconds.
 
-    Raises ``StartupError`` when the library's index does not answer.
+    The photo has 640 x 480 pixels, or as many as photos may have. Raises ``StartupError`` when the
+    library's index does not answer.
     """
-    noise = np.random.default_rng(0).integers(0, 255, (480, 640, 3), np.uint8)
+    shrink = min(1.0, math.sqrt(max_pixels / (640 * 480)))
+    height_px, width_px = int(480 * shrink), int(640 * shrink)
+    noise = np.random.default_rng(0).integers(0, 255, (height_px, width_px, 3), np.uint8)
     _, encoded = cv2.imencode(".jpg", cv2.GaussianBlur(noise, (0, 0), 5))
     data = encoded.tobytes()
+    box_px = (width_px / 3, height_px / 12, width_px / 3, height_px * 5 / 6)
     durations_s = []
     for _ in range(_WARM_UP_RUNS):
         started_s = time.perf_counter()
         try:
             pipeline.estimate(data, PhotoQuery(max_people=1))
-            pipeline.estimate(data, PhotoQuery(box_px=(220.0, 40.0, 200.0, 400.0)))
+            pipeline.estimate(data, PhotoQuery(box_px=box_px))
         except LibraryUnavailableError as error:
             raise StartupError(str(error.__cause__)) from error
         durations_s.append(time.perf_counter() - started_s)

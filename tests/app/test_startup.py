@@ -50,6 +50,13 @@ def test_an_address_that_is_taken(tmp_path: Path, library_dir: Path) -> None:
     assert "POSEMATCH_PORT" in said
 
 
+def test_limits_below_an_ordinary_photo(tmp_path: Path, library_dir: Path) -> None:
+    settings = {"library_dir": library_dir, "max_pixels": 1_000, "max_body_bytes": 1_000}
+    with Server(tmp_path / "log", **settings) as server:
+        photo = cv2.imencode(".png", np.zeros((40, 25, 3), np.uint8))[1].tobytes()
+        assert server.client.post("/v1/poses", content=photo).status_code == 200
+
+
 def test_missing_library(tmp_path: Path) -> None:
     said = refusal(tmp_path, library_dir=tmp_path / "none")
     assert str(tmp_path / "none") in said
