@@ -2,7 +2,7 @@
 
 A small residual MLP after Martinez et al. (ICCV 2017). It knows neither size nor distance: joints
 go in as the camera sees them, and out come, for each, where in the image it really is and how much
-nearer or farther than the hips, relative to the hips' own distance. ``models.training.lifter`` has
+nearer or farther than the hips, relative to the hips' own distance. ``models.training.lifter_network`` has
 the architecture and what it is trained on.
 """
 
