@@ -370,7 +370,7 @@ def _why_not_liftable(joints_px: Floats, confidence: Floats) -> str | None:
 
 def _why_not_seen(view: CentredView) -> str | None:
     """Why no camera sees somebody like that, or None if one may: a wrong focal length, mostly."""
-    remedy = "is the focal length right, in pixels of this photo?"
+    remedy = "check the focal length, which is in pixels of this photo"
     off_axis = view.rotation[2, 2] < math.cos(math.radians(MAX_OFF_AXIS_DEG))
     if off_axis:
         return (
