@@ -43,7 +43,7 @@ def misplaced(
     seen = np.flatnonzero(confidence > 0)
     apart = px_per_unit * np.sqrt(((learned.points - points)[seen] ** 2).sum(1))
     worst = int(np.argmax(apart))
-    usual = float(np.median(apart)) + _CLOSE_PX
+    usual = float(np.sort(apart)[len(apart) // 2]) + _CLOSE_PX
     return int(seen[worst]) if apart[worst] > _ASTRAY * usual else None
 
 

@@ -23,6 +23,8 @@ def test_info(server: Server) -> None:
     assert len(info.model.sha256) == 64
     assert info.limits.max_body_bytes == 2_000_000
     assert info.licences
+    assert [network.kind for network in info.networks] == ["pose", "people", "lift"]
+    assert info.networks[2].input_px is None
 
 
 def test_request_ids_are_taken_or_made(server: Server) -> None:
