@@ -2,8 +2,8 @@
 
 A small residual MLP after Martinez et al. (ICCV 2017). It knows neither size nor distance: joints
 go in as the camera sees them, and out come, for each, where in the image it really is and how much
-nearer or farther than the hips, relative to the hips' own distance. ``models.training.lifter_network`` has
-the architecture and what it is trained on.
+nearer or farther than the hips, relative to the hips' own distance. The architecture is in
+``models.training.lifter_network``, what it is trained on in ``models.training.lifter_samples``.
 """
 
 from __future__ import annotations
