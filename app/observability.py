@@ -8,7 +8,7 @@ import random
 import re
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from datetime import UTC, datetime
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Info
@@ -68,6 +68,12 @@ class Metrics:
             buckets=(0, 1, 2, 3, 5, 10),
             registry=self.registry,
         )
+        self.answered = Counter(
+            "posematch_people",
+            "People answered, of photos or of joints that were given",
+            ["source"],
+            registry=self.registry,
+        )
         self.far_from_library = Counter(
             "posematch_far_from_library",
             "People unlike anything in the library",
@@ -94,6 +100,16 @@ class Metrics:
         )
         ProcessCollector(registry=self.registry)
         PlatformCollector(registry=self.registry)
+
+    def count_answer(
+        self, source: str, timings_ms: Mapping[str, float], warnings: Iterable[Collection[str]]
+    ) -> None:
+        """Count an answer about a "photo" or "joints": its stages, its people's warnings."""
+        for stage, spent_ms in timings_ms.items():
+            self.stage_seconds.labels(stage).observe(spent_ms / 1e3)
+        for of_one in warnings:
+            self.answered.labels(source).inc()
+            self.far_from_library.inc("far_from_library" in of_one)
 
     def watch(
         self,

@@ -65,6 +65,8 @@ async def lift_people(request: Request, service: ServiceDep, engine: EngineDep) 
 
             answer, encoded = await service.admission.run("lift", work, arrival)
     request.state.timings_ms.update(answer.timings_ms)
+    warnings = (person.warnings for person in answer.people)
+    service.metrics.count_answer("joints", answer.timings_ms, warnings)
     return Response(encoded, media_type="application/json")
 
 

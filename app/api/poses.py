@@ -198,11 +198,9 @@ def _work(
 
 
 def _observe(service: Service, answer: schemas.PosesAnswer) -> None:
-    for stage, spent_ms in answer.timings_ms.items():
-        service.metrics.stage_seconds.labels(stage).observe(spent_ms / 1e3)
+    warnings = (person.warnings for person in answer.people)
+    service.metrics.count_answer("photo", answer.timings_ms, warnings)
     service.metrics.people.observe(len(answer.people))
-    far = sum("far_from_library" in person.warnings for person in answer.people)
-    service.metrics.far_from_library.inc(far)
 
 
 @router.post(

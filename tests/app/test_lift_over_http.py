@@ -254,3 +254,19 @@ def test_joints_of_another_skeleton_than_named_are_refused(
     body = request_of(render, people=[in_skeleton(render, "coco17")])
     document = problem(server.client.post("/v1/lift", json=body), 422, "invalid-input")
     assert "unknown joints of lsp14 in people.0: ['left_ankle'" in str(document)
+
+
+def test_lifted_people_count_in_the_metrics(server: Server, renders: list[Render]) -> None:
+    names = (
+        'posematch_people_total{source="joints"}',
+        'posematch_people_total{source="photo"}',
+        'posematch_stage_seconds_count{stage="match"}',
+        "posematch_far_from_library_total",
+    )
+    lift(server, request_of(renders[0]))
+    server.client.post("/v1/poses", content=renders[0].data)
+    before = [server.metric(name) for name in names]
+    people = lift(server, request_of(renders[0], people=[person_of(renders[0])] * 3))
+    far = sum("far_from_library" in person["warnings"] for person in people)
+    after = [server.metric(name) for name in names]
+    assert [b - a for a, b in zip(before, after, strict=True)] == [3, 0, 1, far]
