@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from models.errors import ModelError
 
@@ -48,6 +48,12 @@ class PoseOutput(_Frozen):
     looks: Literal[1, 2] = Field(1, description="2: a second, mirrored and upright look per crop")
     confidence: ConfidenceCalibration | None = None
     spread: SpreadCalibration | None = None
+
+    @model_validator(mode="after")
+    def _two_looks_add_logits(self) -> Self:
+        if self.looks == 2 and self.maps != "logits":
+            raise ValueError("two looks are averaged as logits: looks 2 needs maps logits")
+        return self
 
     @property
     def side_px(self) -> int:

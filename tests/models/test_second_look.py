@@ -1,8 +1,12 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from library_store.skeleton import L_HIP, L_SHOULDER, LSP14, R_HIP, R_SHOULDER
+from models.card import WEIGHTS_DIR, read_card
+from models.errors import ModelError
 from models.heatmaps import sub_cell_peaks
 from models.second_look import leans, looked_at, mirrored_upright
 
@@ -103,3 +107,12 @@ def test_who_is_seen_clearly_is_not_looked_at_again() -> None:
     assert seen == [3, 1]
     np.testing.assert_array_equal(both[[0, 2]], np.concatenate([clear, clear]))
     assert not np.array_equal(both[1], doubtful[0])
+
+
+def test_a_card_cannot_ask_for_two_looks_at_beliefs(tmp_path: Path) -> None:
+    card = (WEIGHTS_DIR / "cpm-int8.json").read_text()
+    assert '"looks": 2' in card
+    path = tmp_path / "cpm-int8.json"
+    path.write_text(card.replace('"maps": "logits"', '"maps": "beliefs"'))
+    with pytest.raises(ModelError, match="looks 2 needs maps logits"):
+        read_card(path)
