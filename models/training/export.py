@@ -38,7 +38,10 @@ PHOTO_PX = 320
 LABELLED = "Leeds Sports Pose Extended (Johnson & Everingham 2011, research use), human labels"
 PHOTOS = "web photos of everyday and sport poses, labels by BlazePose heavy and a mobile CPM"
 RENDERED = "rendered people: MakeHuman bodies (CC0) in CMU mocap poses"
-SCENES = "whole street and sport scenes, boxes by the BlazePose detector and landmark network"
+SCENES = (
+    "whole street and sport scenes, boxes by the BlazePose detector and landmark network, "
+    "and by earlier versions of these networks"
+)
 RESEARCH = (
     "trained partly on images published for research use: judge whether that suits a commercial use"
 )
