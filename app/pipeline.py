@@ -223,7 +223,7 @@ class Pipeline:
         observations = [
             Observation(
                 joints_px=found.positions_px,
-                confidence=found.peak if found.confidence is None else found.confidence,
+                confidence=found.belief,
                 covariance_px2=found.covariance_px2,
             )
             for found in joints

@@ -124,8 +124,11 @@ def empty_patches(scenes: list[Scene], rng: np.random.Generator) -> list[Image]:
 
 def finders() -> dict[str, Find]:
     """The person network alone, and what the service would answer, with the networks it chooses."""
-    pose, people = chosen_networks(load_settings())
-    detector, estimator = PersonDetector(people), PoseEstimator(pose)
+    settings = load_settings()
+    pose, people = chosen_networks(settings)
+    where, provider = settings.weights_dir, settings.provider
+    detector = PersonDetector(people, weights_dir=where, provider=provider)
+    estimator = PoseEstimator(pose, weights_dir=where, provider=provider)
 
     def answered(image: Image) -> list[PersonBox]:
         boxes = detector.detect(image, MOST_PEOPLE)

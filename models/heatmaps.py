@@ -33,6 +33,11 @@ class Joints2D:
     sigma_px: Floats | None
     peak: Floats
 
+    @property
+    def belief(self) -> Floats:
+        """What is known of each joint's presence (J,): ``confidence``, or else ``peak``."""
+        return self.peak if self.confidence is None else self.confidence
+
 
 def marginals(maps: NDArray[np.float32], kind: str) -> Maps:
     """Each joint's distribution over the cells (eq. 3), (N, J, h, w), summing to 1.

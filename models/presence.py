@@ -20,8 +20,7 @@ SAME_PERSON = 0.1
 
 def belief(box: PersonBox, person: Joints2D) -> float:
     """How far both networks believe that ``box`` shows somebody, 0..1."""
-    joints = person.peak if person.confidence is None else person.confidence
-    return box.score * float(np.sort(joints)[-SURE_JOINTS:].mean())
+    return box.score * float(np.sort(person.belief)[-SURE_JOINTS:].mean())
 
 
 def present(boxes: Sequence[PersonBox], people: Sequence[Joints2D]) -> list[int]:

@@ -68,8 +68,7 @@ def look_at_videos(views: Views, videos: dict[Key, Path]) -> tuple[Views, Seen2D
             )
             (joints,) = estimator.estimate(image, [box])
             points.append(joints.positions_px)
-            belief = joints.peak if joints.confidence is None else joints.confidence
-            confidence.append(belief)
+            confidence.append(joints.belief)
             covariance.append(joints.covariance_px2)
             rows.append(row)
             read += 1

@@ -17,6 +17,8 @@ from models.training.dataset import Image, LabelledCrop
 from models.training.scenes import (
     LabelledScene,
     SceneSample,
+    backdrop,
+    box_of,
     cells,
     moved,
     scene_view,
@@ -71,11 +73,7 @@ def crowd(
             for box, area in zip(scene.boxes, areas, strict=True)
         ]
     else:
-        back = backs[rng.integers(len(backs))]
-        zoom = max(size[0] / back.shape[1], size[1] / back.shape[0])
-        zoom *= float(np.exp(rng.uniform(0, 0.7)))
-        free = np.array(size) - zoom * np.array(back.shape[1::-1])
-        image, _ = place(back, size, zoom, rng.uniform(free, 0), False, np.zeros(3))
+        image = backdrop(backs, size, 0.7, rng)
         trust = np.full((size[1] // 8, size[0] // 8), 0.6, np.float32)
         members = []
     height = float(np.exp(rng.uniform(np.log(36), np.log(0.9 * size[1]))))
@@ -83,8 +81,7 @@ def crowd(
     unsure: list[NDArray[np.float32]] = []
     for _ in range(rng.integers(2, 7)):
         crop = crops[rng.integers(len(crops))]
-        known = crop.joints_px[crop.weight > 0]
-        box = np.concatenate([known.min(0), known.max(0)])[None].astype(np.float32)
+        box = box_of(crop)
         extent = float((box[0, 2:] - box[0, :2]).max())
         scale = height * float(np.exp(rng.normal(0, 0.15))) / extent
         flip = bool(rng.random() < 0.5)

@@ -7,7 +7,6 @@ on the scenes that training held out, against the teacher's boxes (label_scenes.
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import cv2
@@ -17,8 +16,7 @@ from models.card import WEIGHTS_DIR, read_card, write_card
 from models.cost import cpu_ms
 from models.person_detector import PersonDetector, corners, iou
 from models.session import OnnxModel
-from models.training.dataset import Image, decode_members
-from models.training.scenes import DEV_ONE_IN
+from models.training.scenes import LabelledScene, read_scenes
 
 SURE = 0.7
 """Teacher's score from which a box has to be found."""
@@ -26,17 +24,16 @@ SAME, STRANGE = 0.5, 0.3
 """Overlap from which a box is the teacher's, and up to which it is none of the teacher's."""
 
 
-def recall_and_extra(
-    detector: PersonDetector, scenes: list[tuple[Image, np.ndarray]]
-) -> tuple[float, float]:
-    """Share of the sure teacher boxes (x0, y0, x1, y1, score) found; strange boxes a scene."""
+def recall_and_extra(detector: PersonDetector, scenes: list[LabelledScene]) -> tuple[float, float]:
+    """Share of the sure teacher boxes found; strange boxes a scene."""
     found = wanted = extra = 0
-    for image, people in scenes:
-        boxes = corners(detector.detect(image, 100))
-        sure = people[people[:, 4] >= SURE, :4]
+    for scene in scenes:
+        boxes = corners(detector.detect(scene.image, 100))
+        known = scene.people[:, :4].astype(np.float64)
+        sure = known[scene.people[:, 4] >= SURE]
         found += int((iou(boxes, sure).max(0, initial=0) > SAME).sum())
         wanted += len(sure)
-        extra += int((iou(boxes, people[:, :4]).max(1, initial=0) < STRANGE).sum())
+        extra += int((iou(boxes, known).max(1, initial=0) < STRANGE).sum())
     return found / wanted, extra / len(scenes)
 
 
@@ -50,11 +47,7 @@ def main() -> None:
     args = parser.parse_args()
     cv2.setNumThreads(1)
 
-    images = decode_members(args.scenes)
-    records = json.loads(args.scenes_labels.read_text())[::DEV_ONE_IN]
-    scenes = [
-        (images[r["image"]], np.array(r["people"], np.float64).reshape(-1, 5)) for r in records
-    ]
+    _, scenes = read_scenes(args.scenes, args.scenes_labels)
     detector = PersonDetector(args.name, weights_dir=args.weights)
     recall, extra = recall_and_extra(detector, scenes)
     path = args.weights / f"{args.name}.json"

@@ -9,7 +9,6 @@ chosen by eye from that table; held-out people judge it (``evaluation.people``).
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import cv2
@@ -23,8 +22,8 @@ from models.person_detector import PersonDetector, corners, iou
 from models.pose_estimator import PoseEstimator
 from models.presence import belief
 from models.training.crowds import calm_patches
-from models.training.dataset import Image, decode_members, held_out, load
-from models.training.scenes import DEV_ONE_IN, LabelledScene, mosaic
+from models.training.dataset import Image, held_out, load
+from models.training.scenes import mosaic, read_scenes
 
 SURE, SAME, STRANGE = 0.7, 0.5, 0.3
 MOSAICS, MOSAIC_SIZE = 400, (640, 480)
@@ -61,13 +60,7 @@ def main() -> None:
     find = Finder(args.people, args.pose, args.weights)
     console = Console(stderr=True)
 
-    images = decode_members(args.data / "photos_scenes.tar")
-    records = json.loads(args.scenes_labels.read_text())
-    scenes = [
-        LabelledScene(images[r["image"]], np.array(r["people"], np.float32).reshape(-1, 5))
-        for i, r in enumerate(records)
-        if i % DEV_ONE_IN
-    ]
+    scenes, _ = read_scenes(args.data / "photos_scenes.tar", args.scenes_labels)
     somebody: list[float] = []
     for scene in track(scenes, "scenes", transient=True, console=console):
         boxes, beliefs = find(scene.image)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 
 from models.training.augment import expose
 from models.training.cutout import place
-from models.training.dataset import Image, LabelledCrop
+from models.training.dataset import Image, LabelledCrop, decode_members
 
 SURE, UNSURE = 0.6, 0.3
 DEV_ONE_IN = 8
@@ -23,6 +25,16 @@ class LabelledScene:
 
     image: Image
     people: NDArray[np.float32]
+
+
+def read_scenes(images: Path, labels: Path) -> tuple[list[LabelledScene], list[LabelledScene]]:
+    """The scenes to train on and the held-out ones, as ``label_scenes`` labelled them."""
+    pictures = decode_members(images)
+    scenes = [
+        LabelledScene(pictures[r["image"]], np.array(r["people"], np.float32).reshape(-1, 5))
+        for r in json.loads(labels.read_text())
+    ]
+    return [s for i, s in enumerate(scenes) if i % DEV_ONE_IN], scenes[::DEV_ONE_IN]
 
 
 @dataclass(frozen=True)
@@ -87,8 +99,7 @@ def scene_view(
 
 def portrait(crop: LabelledCrop, size: tuple[int, int], rng: np.random.Generator) -> SceneSample:
     """One crop over the whole canvas, its own background carried on: a photo of one person."""
-    known = crop.joints_px[crop.weight > 0]
-    box = np.concatenate([known.min(0), known.max(0)])[None].astype(np.float32)
+    box = box_of(crop)
     cover = max(size) / max(crop.image.shape[:2])
     scale = cover * float(np.exp(rng.uniform(np.log(0.75), np.log(1.4))))
     flip = bool(rng.random() < 0.5)
@@ -120,6 +131,24 @@ def _paste_decoys(image: Image, empty: list[Image], rng: np.random.Generator) ->
         image[y : y + h, x : x + w] = cv2.resize(patch, (w, h), interpolation=cv2.INTER_AREA)
 
 
+def box_of(crop: LabelledCrop) -> NDArray[np.float32]:
+    """The corner box around the known joints, (1, 4) px of the crop."""
+    known = crop.joints_px[crop.weight > 0]
+    return np.concatenate([known.min(0), known.max(0)])[None].astype(np.float32)
+
+
+def backdrop(
+    backs: list[Image], size: tuple[int, int], log_zoom: float, rng: np.random.Generator
+) -> Image:
+    """One of ``backs`` over a canvas of ``size`` (w, h), enlarged up to e^``log_zoom`` times."""
+    back = backs[rng.integers(len(backs))]
+    cover = max(size[0] / back.shape[1], size[1] / back.shape[0])
+    zoom = float(np.exp(rng.uniform(0, log_zoom))) * cover
+    free = np.array(size) - zoom * np.array(back.shape[1::-1])
+    image, _ = place(back, size, zoom, rng.uniform(free, 0), False, np.zeros(3))
+    return image
+
+
 def mosaic(
     crops: list[LabelledCrop],
     empty: list[Image],
@@ -127,20 +156,14 @@ def mosaic(
     rng: np.random.Generator,
 ) -> SceneSample:
     """People cut out of their crops on a background without any (0 to 4 of them)."""
-    back = empty[rng.integers(len(empty))]
-    zoom = float(np.exp(rng.uniform(0, 1.0))) * max(
-        size[0] / back.shape[1], size[1] / back.shape[0]
-    )
-    free = np.array(size) - zoom * np.array(back.shape[1::-1])
-    image, _ = place(back, size, zoom, rng.uniform(free, 0), False, np.zeros(3))
+    image = backdrop(empty, size, 1.0, rng)
     _paste_decoys(image, empty, rng)
     trust = np.ones((size[1] // 8, size[0] // 8), np.float32)
     boxes: list[NDArray[np.float32]] = []
     many = int(rng.choice([0, 1, 2, 3, 4], p=[0.12, 0.4, 0.23, 0.15, 0.1]))
     for index in rng.integers(0, len(crops), many):
         crop = crops[index]
-        known = crop.joints_px[crop.weight > 0]
-        box = np.concatenate([known.min(0), known.max(0)])[None].astype(np.float32)
+        box = box_of(crop)
         extent = float((box[0, 2:] - box[0, :2]).max())
         largest = 1.05 * size[1] if many == 1 else 0.7 * size[1]
         scale = float(np.exp(rng.uniform(np.log(28), np.log(largest)))) / extent

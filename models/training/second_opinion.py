@@ -57,9 +57,8 @@ def opinions(image: Image, detector: PersonDetector, estimator: PoseEstimator) -
         tile = np.ascontiguousarray(image[y : y + h, x : x + w])
         boxes = detector.detect(tile, 10, threshold=LEAST_SCORE)
         for box, pose in zip(boxes, estimator.estimate(tile, boxes), strict=True):
-            belief = pose.peak if pose.confidence is None else pose.confidence
-            confidence = float(np.sort(belief)[-BEST_JOINTS:].mean())
-            seen = belief > SEEN_JOINT
+            confidence = float(np.sort(pose.belief)[-BEST_JOINTS:].mean())
+            seen = pose.belief > SEEN_JOINT
             if confidence < LEAST_CONFIDENCE or seen.sum() < SEEN_JOINTS:
                 continue
             low, high = pose.positions_px[seen].min(0), pose.positions_px[seen].max(0)

@@ -6,7 +6,6 @@ Learns from mosaics of the labelled crops and from scenes that label_scenes.py h
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 import cv2
@@ -20,15 +19,13 @@ from models.person_detector import decode, iou
 from models.training import loop
 from models.training.crowds import calm_patches, crowd
 from models.training.cutout import whole
-from models.training.dataset import decode_members
 from models.training.network import PersonConfig, PersonNetwork
 from models.training.scenes import (
-    DEV_ONE_IN,
     UNSURE,
-    LabelledScene,
     SceneSample,
     mosaic,
     portrait,
+    read_scenes,
     scene_view,
 )
 from models.training.train import read_crops
@@ -97,12 +94,7 @@ def main() -> None:
 
     crops, _ = read_crops(args.data, args.train, "")
     entire = [crop for crop in crops if whole(crop)]
-    images = decode_members(args.data / args.scenes)
-    scenes = [
-        LabelledScene(images[r["image"]], np.array(r["people"], np.float32).reshape(-1, 5))
-        for r in json.loads(args.scenes_labels.read_text())
-    ]
-    dev, train = scenes[::DEV_ONE_IN], [s for i, s in enumerate(scenes) if i % DEV_ONE_IN]
+    train, dev = read_scenes(args.data / args.scenes, args.scenes_labels)
     empty = [s.image for s in train if not len(s.people) or s.people[:, 4].max() < UNSURE]
     calm = empty + calm_patches(train, np.random.default_rng(args.seed))
     print(
