@@ -11,6 +11,7 @@ eleven clips of four people): thoraxes are not quite as long as upper backs.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,6 +32,12 @@ from library_store.importers.rotation import euler
 from library_store.skeleton import HEAD_TOP, L_WRIST, LSP14, R_WRIST
 
 _ZERO = 1e-6
+
+_MOTION = re.compile(
+    r"^\s*MOTION\s+Frames\s*:\s*(?P<frames>\S+)\s+Frame\s+Time\s*:\s*(?P<time_s>\S+)",
+    re.IGNORECASE | re.MULTILINE,
+)
+_BRACE = re.compile(r"[{}]")
 
 
 @dataclass(frozen=True)
@@ -71,7 +78,8 @@ def read(path: Path, *, mapping: Path | None = None) -> Clip:
     subject = action = ""
     if table.is_cmu:
         subject, action, known_rate, notes = describe_cmu(path)
-        findings += notes
+        if subject:
+            findings += notes
         if subject and abs(known_rate - rate) > 1.0:
             findings.append(
                 f"the file says {rate:.0f} Hz, CMU's index {known_rate:.0f}: the latter"
@@ -92,16 +100,16 @@ def read(path: Path, *, mapping: Path | None = None) -> Clip:
 
 def parse(path: Path) -> BvhFile:
     """Parse a BVH file; ``MocapError`` says where it is not one."""
-    text = path.read_text(encoding="latin-1")
-    head, marker, tail = text.partition("MOTION")
-    if not marker or not head.lstrip().startswith("HIERARCHY"):
-        raise MocapError(path, "not a BVH file: HIERARCHY and MOTION expected")
+    text = _text(path)
+    motion = _MOTION.search(text)
+    if motion is None or not text.lstrip().upper().startswith("HIERARCHY"):
+        raise MocapError(
+            path, "not a BVH file: HIERARCHY and MOTION with Frames and Frame Time expected"
+        )
     try:
-        joints = _parse_hierarchy(head.split()[1:])
-        lines = tail.split("\n", 3)
-        n_frames = int(lines[1].split(":")[1])
-        frame_time_s = float(lines[2].split(":")[1])
-        values = np.array(lines[3].split(), dtype=np.float64)
+        joints = _parse_hierarchy(_BRACE.sub(r" \g<0> ", text[: motion.start()]).split()[1:])
+        n_frames, frame_time_s = int(motion["frames"]), float(motion["time_s"])
+        values = np.array(text[motion.end() :].split(), dtype=np.float64)
     except (ValueError, IndexError, StopIteration) as error:
         raise MocapError(path, f"not a whole BVH file ({error!r})") from error
     width = sum(len(joint.channels) for joint in joints)
@@ -114,24 +122,35 @@ def parse(path: Path) -> BvhFile:
     return BvhFile(tuple(joints), values.reshape(n_frames, width), frame_time_s)
 
 
+def _text(path: Path) -> str:
+    """What a BVH file says, in UTF-8 as programs write it today, or in Latin-1 as older ones do."""
+    content = path.read_bytes()
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    return text.replace("\r", "\n")
+
+
 def _parse_hierarchy(words: list[str]) -> list[Joint]:
     joints: list[Joint] = []
     open_joints: list[int] = []
     tokens = iter(words)
     for token in tokens:
-        if token in ("ROOT", "JOINT", "End"):
+        keyword = token.upper()
+        if keyword in ("ROOT", "JOINT", "END"):
             name = next(tokens)
             parent = open_joints[-1] if open_joints else -1
-            if token == "End":
+            if keyword == "END":
                 name = f"{joints[parent].name}.end"
             while (brace := next(tokens)) != "{":  # names may have spaces
                 name += f" {brace}"
             open_joints.append(len(joints))
             joints.append(Joint(name, parent, np.zeros(3), ()))
-        elif token == "OFFSET":
+        elif keyword == "OFFSET":
             offset = np.array([float(next(tokens)) for _ in range(3)])
             joints[open_joints[-1]] = replace(joints[open_joints[-1]], offset=offset)
-        elif token == "CHANNELS":
+        elif keyword == "CHANNELS":
             channels = tuple(next(tokens).lower() for _ in range(int(next(tokens))))
             known = {f"{axis}{kind}" for axis in "xyz" for kind in ("position", "rotation")}
             if not known.issuperset(channels):

@@ -189,7 +189,7 @@ def read_mapping(path: Path) -> JointMapping:
     """Read a mapping file (.toml, else JSON); ``MocapError`` names the file and what it lacks."""
     kind = "TOML" if path.suffix.lower() == ".toml" else "JSON"
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
         given: Any = tomllib.loads(text) if kind == "TOML" else json.loads(text)
     except (OSError, ValueError) as error:
         raise MocapError(path, f"cannot be read as {kind}: {error}") from error

@@ -118,6 +118,48 @@ def test_malformed_files_are_refused(tmp_path: Path, old: str, new: str, problem
     assert str(path) in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("\n", "\r\n"),
+        ("\n", "\r"),
+        (" ", "\t"),
+        ("HIERARCHY", "\ufeffHIERARCHY"),
+        ("MOTION\n", "MOTION\n\n"),
+        ("Frames: 2\n", "Frames:\t2 \n\n"),
+        ("\n{", " {"),
+        ("JOINT b\n  {", "JOINT b{"),
+        ("End Site", "END SITE"),
+        ("      OFFSET 1 0 0", "      OFFSET 1 0 0\n      CHANNELS 0"),
+        ("OFFSET 0 2 0", "OFFSET 0 2.0e+00 0"),
+        ("ROOT a", "ROOT LocoMOTION 体"),
+    ],
+)
+def test_the_same_motion_written_another_way(tmp_path: Path, old: str, new: str) -> None:
+    path = tmp_path / "chain.bvh"
+    path.write_bytes(CHAIN.replace(old, new).encode())
+    plain_file = parse(write(tmp_path / "plain.bvh", CHAIN))
+    assert_allclose(world_positions(parse(path)), world_positions(plain_file))
+
+
+def test_names_in_any_script(tmp_path: Path) -> None:
+    own = dict(zip(LSP14.joint_names, TABLES[0].targets, strict=True)) | {"neck": "頸"}
+    text = cmu_bvh(walk()).replace("JOINT Neck1", "JOINT 頸")
+    path, mapping = tmp_path / "tanz.bvh", tmp_path / "mapping.json"
+    path.write_bytes(text.encode())
+    mapping.write_bytes(b"\xef\xbb\xbf" + json.dumps(own, ensure_ascii=False).encode())
+    assert len(read(path, mapping=mapping)[0]) == 12
+    path.write_bytes(text.replace("頸", "Köper").encode("latin-1"))
+    assert "Köper" in {joint.name for joint in parse(path).joints}
+
+
+def test_a_frame_rate_is_the_files_where_the_name_is_not_cmus(tmp_path: Path) -> None:
+    text = cmu_bvh(walk()).replace("Frame Time: .0083333", "Frame Time: 0.04")
+    (clip,) = read(write(tmp_path / "dance.bvh", text))
+    assert clip.frame_rate_hz == 25.0
+    assert not any("frame rate" in finding for finding in clip.findings)
+
+
 def test_unknown_names_are_listed_and_a_mapping_file_helps(tmp_path: Path) -> None:
     text = re.sub(r"(ROOT|JOINT) (\w+)", r"\1 my\2", cmu_bvh(walk()))
     path = write(tmp_path / "dance.bvh", text)
