@@ -13,6 +13,7 @@ skull: the head top is 1.6 of its length from its start, as in the prior's data.
 
 from __future__ import annotations
 
+import codecs
 import csv
 import math
 from dataclasses import dataclass
@@ -58,6 +59,7 @@ SUBJECTS_60_HZ = frozenset((33, 34, 42, 60, 61, 62, 74, 75, 77, 79, 80, 87, 88, 
 INDEX_FILE = "cmu_index.csv"
 """Looked for beside the clip and in the three folders above: actions and frame rates by clip."""
 
+_DEGREES_PER = {"deg": 1.0, "degrees": 1.0, "rad": math.degrees(1.0), "radians": math.degrees(1.0)}
 _NO_BONE = "root"
 _ROOT_ORDER = ("tx", "ty", "tz", "rx", "ry", "rz")
 
@@ -74,13 +76,17 @@ class Bone:
 
 @dataclass(frozen=True)
 class SkeletonFile:
-    """An ASF: bones by name, parents before children, and how the root moves."""
+    """An ASF: bones by name, parents before children, and how the root moves.
+
+    ``degrees_per_angle`` is the unit of its angles, and of an AMC's that states none.
+    """
 
     bones: dict[str, Bone]
     root_order: tuple[str, ...]
     root_axes: str
     root_frame: Float
     mm_per_unit: float
+    degrees_per_angle: float
 
 
 def read(path: Path, *, skeleton: Path | None = None) -> Clip:
@@ -154,10 +160,12 @@ def _index_row(index: Path, subject: int, number: int) -> tuple[str, float] | No
 def read_asf(path: Path) -> SkeletonFile:
     """Parse an ASF file; ``MocapError`` says what is missing."""
     try:
-        sections = _sections(path.read_text(encoding="latin-1"))
+        sections = _sections(_text(path))
         units = {words[0]: words[1] for words in sections["units"]}
-        if units.get("angle", "deg") != "deg":
-            raise MocapError(path, "angles in radians are not supported; CMU's files use degrees")
+        degrees = _DEGREES_PER[units.get("angle", "deg").lower()]
+        length = float(units["length"])
+        if not 0.0 < length < math.inf:
+            raise ValueError(f"length {length}")
         root = {words[0]: words[1:] for words in sections["root"]}
         parents = {child: words[0] for words in sections["hierarchy"] for child in words[1:]}
         seen = [_NO_BONE]
@@ -166,8 +174,8 @@ def read_asf(path: Path) -> SkeletonFile:
                 raise ValueError(f"bone {child} hangs on {parent}, which is not above it")
             seen.append(child)
         at_rest = {bone["name"][0]: bone for bone in _blocks(sections["bonedata"])}
-        bones = {name: _bone(at_rest[name], parent) for name, parent in parents.items()}
-        orientation = np.array([float(v) for v in root["orientation"]])
+        bones = {name: _bone(at_rest[name], parent, degrees) for name, parent in parents.items()}
+        orientation = degrees * np.array([float(v) for v in root["orientation"]])
         axes = root["axis"][0].lower()
         order = tuple(word.lower() for word in root["order"])
         if sorted(order) != sorted(_ROOT_ORDER) or sorted(axes) != ["x", "y", "z"]:
@@ -177,13 +185,18 @@ def read_asf(path: Path) -> SkeletonFile:
             root_order=order,
             root_axes=axes,
             root_frame=euler(axes[::-1], orientation[::-1]),
-            mm_per_unit=MM_PER_INCH / float(units["length"]),
+            mm_per_unit=MM_PER_INCH / length,
+            degrees_per_angle=degrees,
         )
     except (KeyError, IndexError, ValueError) as error:
         raise MocapError(path, f"not a whole ASF skeleton ({error!r})") from error
 
 
-def _bone(block: dict[str, list[str]], parent: str) -> Bone:
+def _text(path: Path) -> str:
+    return path.read_bytes().removeprefix(codecs.BOM_UTF8).decode("latin-1")
+
+
+def _bone(block: dict[str, list[str]], parent: str, degrees: float) -> Bone:
     direction = np.array([float(v) for v in block["direction"][:3]])
     *angles, axes = block["axis"]
     axes = axes.lower()
@@ -193,7 +206,7 @@ def _bone(block: dict[str, list[str]], parent: str) -> Bone:
     return Bone(
         parent=parent,
         offset=direction * float(block["length"][0]),
-        frame=euler(axes[::-1], np.array([float(v) for v in angles])[::-1]),
+        frame=euler(axes[::-1], degrees * np.array([float(v) for v in angles])[::-1]),
         dof=dof,
     )
 
@@ -223,14 +236,19 @@ def _blocks(lines: list[list[str]]) -> list[dict[str, list[str]]]:
 
 
 def read_amc(path: Path, asf: SkeletonFile) -> tuple[Frames, dict[str, Float]]:
-    """Frame numbers (F,) and, by bone, values (F, n) in the order of its degrees of freedom."""
+    """Frame numbers (F,) and, by bone, values (F, n) in the order of its degrees of freedom.
+
+    Angles are in degrees, whichever unit the file has.
+    """
     widths = {name: len(bone.dof) for name, bone in asf.bones.items() if bone.dof}
     widths[_NO_BONE] = len(asf.root_order)
     frames: list[int] = []
     values: dict[str, list[list[float]]] = {name: [] for name in widths}
-    for number, line in enumerate(path.read_text(encoding="latin-1").splitlines(), 1):
-        words = line.split()
-        if not words or line.startswith(("#", ":")):
+    degrees = asf.degrees_per_angle
+    for number, line in enumerate(_text(path).splitlines(), 1):
+        words = line.split("#")[0].split()
+        if not words or words[0].startswith(":"):
+            degrees = _DEGREES_PER.get(words[0][1:].lower(), degrees) if words else degrees
             continue
         try:
             if len(words) == 1:
@@ -246,7 +264,9 @@ def read_amc(path: Path, asf: SkeletonFile) -> tuple[Frames, dict[str, Float]]:
     short = [name for name, rows in values.items() if len(rows) != len(frames)]
     if not frames or short:
         raise MocapError(path, f"{len(frames)} frames, not all with values for {short or 'a bone'}")
-    motion = {name: np.array(rows, dtype=np.float64) for name, rows in values.items()}
+    motion = {name: degrees * np.array(rows, dtype=np.float64) for name, rows in values.items()}
+    places = [i for i, name in enumerate(asf.root_order) if name.startswith("t")]
+    motion[_NO_BONE][:, places] /= degrees
     if not all(math.isfinite(float(rows.sum())) for rows in motion.values()):
         raise MocapError(path, "has values that are not finite")
     return np.array(frames, dtype=np.int64), motion

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +95,54 @@ def test_a_malformed_clip_is_refused(clip_file: Path, old: str, new: str, named:
     with pytest.raises(MocapError, match=named) as caught:
         read(clip_file)
     assert str(clip_file) in str(caught.value)
+
+
+def in_radians(text: str) -> str:
+    """An AMC's angles, three to all but the root's last three, in radians."""
+    lines = []
+    for line in text.splitlines():
+        name, *numbers = line.split() or [""]
+        if numbers and not line.startswith((":", "#")):
+            first = 3 if name == "root" else 0
+            turned = [repr(math.radians(float(n))) for n in numbers[first:]]
+            line = " ".join([name, *numbers[:first], *turned])
+        lines.append(line)
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("stated", ["by both", "by the clip", "by the skeleton"])
+def test_angles_in_radians(clip_file: Path, stated: str) -> None:
+    (truth,) = read(clip_file)
+    said = {"by the skeleton": ""}.get(stated, ":RADIANS")
+    clip_file.write_text(in_radians(clip_file.read_text()).replace(":DEGREES", said))
+    if stated != "by the clip":
+        skeleton = re.sub(
+            r"axis (\S+) (\S+) (\S+)  XYZ",
+            lambda it: (
+                "axis " + " ".join(repr(math.radians(float(a))) for a in it.groups()) + " XYZ"
+            ),
+            ASF.replace("angle deg", "angle rad"),
+        )
+        clip_file.with_name("02.asf").write_text(skeleton)
+    (clip,) = read(clip_file)
+    assert_allclose(clip.positions_mm, truth.positions_mm, atol=0.01)
+
+
+def test_byte_order_marks_and_comments(clip_file: Path) -> None:
+    (truth,) = read(clip_file)
+    for path in (clip_file, clip_file.with_name("02.asf")):
+        path.write_bytes(b"\xef\xbb\xbf# a comment\n" + path.read_bytes())
+    clip_file.write_text(clip_file.read_text().replace("\n2\n", "\n 2 # two\n\n"))
+    (clip,) = read(clip_file)
+    assert_allclose(clip.positions_mm, truth.positions_mm)
+
+
+@pytest.mark.parametrize("length", ["0", "-0.45", "nan", "inf", "long"])
+def test_a_skeleton_without_a_length_is_refused(clip_file: Path, length: str) -> None:
+    asf = clip_file.with_name("02.asf")
+    asf.write_text(ASF.replace("length 0.45", f"length {length}"))
+    with pytest.raises(MocapError, match=r"02\.asf: not a whole ASF"):
+        read(clip_file)
 
 
 def test_a_cut_clip_is_refused(clip_file: Path) -> None:
