@@ -17,7 +17,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -70,10 +70,12 @@ def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
     """The clips of a C3D file, one a person; ``mapping`` is a table from joint to markers."""
     table = read_mapping(mapping) if mapping else None
     file = parse(path)
-    clips = []
+    clips: list[Clip] = []
+    left_out: list[str] = []
     for person, markers in file.people.items():
         named = _joints_of(markers, table, sizes_from(file.stated), file.rate_hz)
         if named is None:
+            left_out += [person or "markers without a prefix"]
             continue
         joints, marker_set, findings = named
         subject = action = ""
@@ -95,11 +97,16 @@ def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
     if not clips:
         there = ", ".join(f"{p}:{m}" if p else m for p, ms in file.people.items() for m in ms)
         known = "; ".join(f"{known.name} ({' '.join(known.markers)})" for known in MARKER_SETS)
-        raise MocapError(
-            path,
-            f"markers are {there[:500] or 'none'}. Known sets are {known}. Others need a mapping "
-            "file: a JSON or TOML table from each joint to a marker or a list of markers",
+        advice = (
+            f"Known sets are {known}. Others need a mapping file: a JSON or TOML table from each "
+            "joint to a marker or a list of markers"
+            if table is None
+            else f"{table.name} names {', '.join(name for it in table.targets for name in it)}"
         )
+        raise MocapError(path, f"markers are {there[:500] or 'none'}. {advice}")
+    if left_out:
+        finding = f"left out, not the markers of a person: {', '.join(left_out)}"
+        clips = [replace(clip, findings=(*clip.findings, finding)) for clip in clips]
     return clips
 
 
@@ -120,6 +127,7 @@ def parse(path: Path) -> C3dFile:
             f"not a whole C3D file: {last + 1 - first} frames announced, {points.shape[1]} found; "
             f"{len(points)} markers with {len(names)} names",
         )
+    points[(points == 0.0).all(axis=-1)] = np.nan  # how some programs write what was not seen
     unit = str(found["unit"]).lower()
     findings = () if unit in _MM_PER_UNIT else (f"unit of length {unit!r}: mm assumed",)
     people: dict[str, dict[str, Float]] = {}

@@ -3,6 +3,7 @@
 Every importer hands its clip to ``checked``. Each mend and each doubt becomes a finding, a sentence
 in ``Clip.findings``; poses that no known mistake explains raise ``MocapError``. In this order:
 
+*a frame rate that is none*, zero or less, is taken as not known;
 *frames with numbers that are not finite* are dropped;
 *a T-pose as the first frame*, with straight arms and a jump to the second, is dropped;
 *units*: trunk + thigh + shank of a standing adult is 1.37 m; a clip that is off by the ratio of
@@ -18,6 +19,7 @@ conversions of CMU's files do; sides of different length, a head too short. Repo
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -89,6 +91,9 @@ def checked(
     """
     findings: list[str] = list(clip.findings)
     positions = clip.positions_mm.astype(np.float64)
+    if not (math.isnan(clip.frame_rate_hz) or 0.0 < clip.frame_rate_hz < math.inf):
+        findings.append(f"a frame rate of {clip.frame_rate_hz:g} Hz is taken as not known")
+        clip = replace(clip, frame_rate_hz=math.nan)
     keep = np.isfinite(positions).all(axis=(1, 2))
     if not keep.all():
         findings.append(f"{np.count_nonzero(~keep)} frames with missing joints dropped")

@@ -164,6 +164,8 @@ def _read_nested(path: Path, npz: NpzFile) -> list[Clip]:
     subjects = held.item() if held.dtype == object and held.size == 1 else None
     if not isinstance(subjects, dict) or not all(isinstance(v, dict) for v in subjects.values()):
         raise MocapError(path, "positions_3d must hold a dict subject → action → positions")
+    if not any(subjects.values()):
+        raise MocapError(path, "positions_3d holds no positions")
     clips = []
     for subject, actions in subjects.items():
         for action, values in actions.items():

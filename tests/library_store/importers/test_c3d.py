@@ -51,6 +51,15 @@ def test_two_people_are_two_clips(tmp_path: Path) -> None:
     assert_allclose(clips[1].positions_mm, clips[0].positions_mm + beside, atol=0.01)
 
 
+def test_who_is_left_out_is_said(tmp_path: Path) -> None:
+    ann = {f"Ann:{name}": track for name, track in TRACKS.items()}
+    box = {"Box:corner": TRACKS["C7"], "*110": TRACKS["T10"]}
+    (clip,) = read(write_c3d(tmp_path / "pair.c3d", ann | box))
+    assert (clip.name, clip.subject) == ("pair_Ann", "Ann")
+    finding = "left out, not the markers of a person: Box, markers without a prefix"
+    assert finding in clip.findings
+
+
 def test_an_axis_that_is_not_stated_is_found(tmp_path: Path) -> None:
     (clip,) = read(write_c3d(tmp_path / "a.c3d", TRACKS, up=""))
     assert any("turned so that Y is up" in finding for finding in clip.findings)
@@ -61,6 +70,7 @@ def test_gaps(tmp_path: Path) -> None:
     tracks = {name: track.copy() for name, track in TRACKS.items()}
     tracks["LKNE"][10:15] = np.nan
     tracks["C7"][30:50] = np.nan
+    tracks["T10"][31:49] = 0.0  # as some programs write what was not seen
     (clip,) = read(write_c3d(tmp_path / "a.c3d", tracks))
     assert "5 marker positions in short gaps filled" in clip.findings
     assert "20 frames with missing joints dropped" in clip.findings
@@ -76,8 +86,11 @@ def test_a_mapping_file_from_joint_to_markers(tmp_path: Path) -> None:
     with pytest.raises(MocapError, match=r"own\.c3d: markers are .*Plug-in Gait.*mapping file"):
         read(path)
     table: dict[str, object] = {joint: f"m{i}" for i, joint in enumerate(LSP14.joint_names)}
-    table["r_wrist"] = ["m4", "far"]
     mapping = tmp_path / "mapping.json"
+    mapping.write_text(json.dumps(table | {"neck": "m99"}))
+    with pytest.raises(MocapError, match=r"markers are M0, .*mapping\.json names m0, m99, m2"):
+        read(path, mapping=mapping)
+    table["r_wrist"] = ["m4", "far"]
     mapping.write_text(json.dumps(table))
     (clip,) = read(path, mapping=mapping)
     wrist = LSP14.index("r_wrist")

@@ -103,6 +103,14 @@ def test_swapped_sides_are_exchanged(standing: Float) -> None:
     assert_allclose(clip.positions_mm, standing, atol=0.1)
 
 
+@pytest.mark.parametrize("rate_hz", [0.0, -30.0, np.inf])
+def test_a_frame_rate_that_is_none_is_not_known(standing: Float, rate_hz: float) -> None:
+    clip = checked(FILE, clip_of(standing, rate_hz))
+    assert np.isnan(clip.frame_rate_hz)
+    assert any("is taken as not known" in finding for finding in clip.findings)
+    assert len(clip.thinned(1.0)) == len(standing)
+
+
 def test_frames_without_joints_are_dropped(standing: Float) -> None:
     gaps = standing.copy()
     gaps[[3, 7], 5] = np.nan

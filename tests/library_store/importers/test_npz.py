@@ -89,7 +89,7 @@ def test_foreign_code_is_not_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "value", [3, {"S1": 4}, {"S1": {"a": np.zeros((5, 9, 3))}}, {"S1": {"a": "b"}}]
+    "value", [3, {}, {"S1": {}}, {"S1": 4}, {"S1": {"a": np.zeros((5, 9, 3))}}, {"S1": {"a": "b"}}]
 )
 def test_nested_values_of_other_kinds_are_refused(tmp_path: Path, value: Any) -> None:
     with pytest.raises(MocapError, match=r"data\.npz"):
