@@ -30,8 +30,7 @@ from models.pck import correct_keypoints
 from models.second_look import looked_at
 from models.session import OnnxModel
 from models.training.augment import Sample, canonical, random_view
-from models.training.dataset import LabelledCrop
-from models.training.train import read_crops
+from models.training.dataset import LabelledCrop, read_crops
 
 NEAR = 0.2
 """In torso lengths: what `confidence` is the probability of."""

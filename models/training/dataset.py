@@ -36,6 +36,9 @@ Image = NDArray[Any]
 """(h, w, 3) uint8 BGR; OpenCV's type stubs promise less."""
 
 HOLD_OUT_ONE_IN = 7
+DEV_LABELLED = 200
+"""Labelled crops of each training file kept aside to choose by; lspet_val is only reported."""
+DEV_RENDERED = 100
 
 
 @dataclass(frozen=True)
@@ -191,3 +194,31 @@ def in_held_out_group(group: int) -> bool:
 def held_out(crop: LabelledCrop) -> bool:
     """Whether the photo that a crop was cut from is held out (whole photos at a time)."""
     return in_held_out_group(crop.group)
+
+
+def read_crops(
+    folder: Path, train: str, test: str
+) -> tuple[list[LabelledCrop], dict[str, list[LabelledCrop]]]:
+    """Training crops, and the held-out ones by name.
+
+    Comma-separated names of tars in ``folder``, or paths, without ".tar"; ``name*2`` is drawn
+    twice as often. Files called rendered* are trained on whole but for a few.
+    """
+    crops: list[LabelledCrop] = []
+    kept: dict[str, list[LabelledCrop]] = {"photos_dev": [], "labelled_dev": []}
+    for item in train.split(","):
+        name, _, times = item.partition("*")
+        loaded = load(folder / f"{name}.tar")
+        if name.startswith("lspet"):
+            kept["labelled_dev"] += loaded[-DEV_LABELLED:]
+            used = loaded[:-DEV_LABELLED]
+        elif Path(name).name.startswith("rendered"):
+            kept.setdefault("rendered_dev", []).extend(loaded[-DEV_RENDERED:])
+            used = loaded[:-DEV_RENDERED]
+        else:
+            kept["photos_dev"] += [c for c in loaded if held_out(c)]
+            used = [c for c in loaded if not held_out(c)]
+        crops += used * int(times or 1)
+    for name in filter(None, test.split(",")):
+        kept[name] = load(folder / f"{name}.tar")
+    return crops, kept

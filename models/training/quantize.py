@@ -34,10 +34,9 @@ from models.card import WEIGHTS_DIR, DetectorOutput, ModelCard, PoseOutput, read
 from models.person_detector import PersonDetector, iou, shrunk
 from models.providers import INT8_FEATURES
 from models.training.augment import canonical
-from models.training.dataset import decode_members
+from models.training.dataset import decode_members, read_crops
 from models.training.export import publish
 from models.training.onnx_graph import INPUT, LAST
-from models.training.train import read_crops
 
 Images = Iterable[NDArray[np.uint8]]
 SUFFIX = "-int8"

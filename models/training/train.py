@@ -6,7 +6,6 @@ Runs on a CPU (in bf16) or a GPU, resumes by itself, is seeded and logs its metr
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,13 +15,9 @@ from torch import Tensor
 from models.pck import correct_keypoints
 from models.training import loop
 from models.training.augment import Sample, canonical, random_view
-from models.training.dataset import LabelledCrop, held_out, load
+from models.training.dataset import LabelledCrop, read_crops
 from models.training.network import ConvolutionalPoseMachine, CpmConfig
 from models.training.objective import total_loss
-
-DEV_LABELLED = 200
-"""Labelled crops of each training file kept aside to choose by; lspet_val is only reported."""
-DEV_RENDERED = 100
 
 
 def to_batch(samples: list[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -70,32 +65,6 @@ def measure(
         known.append(weight.numpy() > 0)
     correct = correct_keypoints(np.concatenate(predicted), np.concatenate(truth))
     return float(correct[np.concatenate(known)].mean())
-
-
-def read_crops(
-    folder: Path, train: str, test: str
-) -> tuple[list[LabelledCrop], dict[str, list[LabelledCrop]]]:
-    """Training crops, and the held-out ones by name.
-
-    Comma-separated names of tars in ``folder``, or paths, without ".tar"; files called rendered*
-    are trained on whole but for a few.
-    """
-    crops: list[LabelledCrop] = []
-    kept: dict[str, list[LabelledCrop]] = {"photos_dev": [], "labelled_dev": []}
-    for name in train.split(","):
-        loaded = load(folder / f"{name}.tar")
-        if name.startswith("lspet"):
-            kept["labelled_dev"] += loaded[-DEV_LABELLED:]
-            crops += loaded[:-DEV_LABELLED]
-        elif Path(name).name.startswith("rendered"):
-            kept.setdefault("rendered_dev", []).extend(loaded[-DEV_RENDERED:])
-            crops += loaded[:-DEV_RENDERED]
-        else:
-            kept["photos_dev"] += [c for c in loaded if held_out(c)]
-            crops += [c for c in loaded if not held_out(c)]
-    for name in filter(None, test.split(",")):
-        kept[name] = load(folder / f"{name}.tar")
-    return crops, kept
 
 
 def main() -> None:

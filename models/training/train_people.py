@@ -19,6 +19,7 @@ from models.person_detector import decode, iou
 from models.training import loop
 from models.training.crowds import calm_patches, crowd
 from models.training.cutout import whole
+from models.training.dataset import read_crops
 from models.training.network import PersonConfig, PersonNetwork
 from models.training.scenes import (
     UNSURE,
@@ -28,7 +29,6 @@ from models.training.scenes import (
     read_scenes,
     scene_view,
 )
-from models.training.train import read_crops
 
 UNIT_PX = 32.0
 """Distances to the box's sides are learned as logarithms of multiples of this."""

@@ -1,6 +1,8 @@
 """What needs no torch: reading data sets, holding photos out, random views."""
 
+import io
 import json
+import tarfile
 from pathlib import Path
 
 import cv2
@@ -8,7 +10,14 @@ import numpy as np
 
 from library_store.skeleton import LSP14
 from models.training.augment import MIRROR, canonical, crop_matrix, random_view
-from models.training.dataset import LabelledCrop, held_out, load
+from models.training.dataset import (
+    DEV_LABELLED,
+    DEV_RENDERED,
+    LabelledCrop,
+    held_out,
+    load,
+    read_crops,
+)
 from models.training.scenes import mosaic
 
 
@@ -38,6 +47,37 @@ def test_labels_are_read_and_hardly_labelled_crops_left_out(tmp_path: Path) -> N
     assert [c.name for c in crops] == ["a.jpg"]
     np.testing.assert_allclose(crops[0].joints_px, joints)
     assert crops[0].weight[-1] == 0
+
+
+def _tar(path: Path, count: int, joints: list[list[float]]) -> None:
+    records = [
+        {"image": f"{path.stem}{i}.jpg", "joints_px": joints, "labelled": [1] * 14}
+        for i in range(count)
+    ]
+    _, jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))
+    members = [("annotations.json", json.dumps({"images": records}).encode())]
+    members += [(str(r["image"]), jpeg.tobytes()) for r in records]
+    with tarfile.open(path, "w") as tar:
+        for name, data in members:
+            info = tarfile.TarInfo(name)
+            info.size = len(data)
+            tar.addfile(info, io.BytesIO(data))
+
+
+def test_a_starred_file_is_drawn_more_often_and_what_is_kept_aside_is_not_trained_on(
+    tmp_path: Path,
+) -> None:
+    joints = np.arange(28.0).reshape(14, 2).tolist()
+    _tar(tmp_path / "lspet_x.tar", DEV_LABELLED + 3, joints)
+    _tar(tmp_path / "rendered_x.tar", DEV_RENDERED + 2, joints)
+    crops, kept = read_crops(tmp_path, "lspet_x*2,rendered_x", "")
+    names = [c.name for c in crops]
+    assert sorted(names) == ["lspet_x0.jpg"] * 2 + ["lspet_x1.jpg"] * 2 + ["lspet_x2.jpg"] * 2 + [
+        "rendered_x0.jpg",
+        "rendered_x1.jpg",
+    ]
+    aside = {c.name for crops_kept in kept.values() for c in crops_kept}
+    assert len(aside) == DEV_LABELLED + DEV_RENDERED and not aside & set(names)
 
 
 def test_a_photo_is_held_out_whole_and_always_the_same_ones() -> None:
