@@ -77,7 +77,8 @@ def test_a_starred_file_is_drawn_more_often_and_what_is_kept_aside_is_not_traine
         "rendered_x1.jpg",
     ]
     aside = {c.name for crops_kept in kept.values() for c in crops_kept}
-    assert len(aside) == DEV_LABELLED + DEV_RENDERED and not aside & set(names)
+    assert len(aside) == DEV_LABELLED + DEV_RENDERED
+    assert not aside & set(names)
 
 
 def test_a_photo_is_held_out_whole_and_always_the_same_ones() -> None:
