@@ -26,7 +26,7 @@ from library_store.errors import LibraryError
 from library_store.manifest import FORMAT, Licence, Manifest, check_files, file_sum, read_manifest
 from library_store.mocap import MocapSettings, gather
 from library_store.prior import DEFAULT_PRIOR, PosePrior
-from library_store.publish import locked, replacing
+from library_store.publish import landing, locked, replacing
 from library_store.sections import Composed, Sampled, Section, captured
 from library_store.sources import NAME_PATTERN, SourceClip
 from library_store.steps import Facts, Steps
@@ -137,17 +137,18 @@ def build_library(
     mocap: Mocap | None = None,
     keep_if: Callable[[Path], bool] | None = None,
 ) -> Manifest:
-    """Build a library and put it at ``directory``, replacing what is there.
+    """Build a library and put it at ``directory``, replacing the library that is there, if any.
 
     ``prior`` alone: sampled poses. ``mocap`` alone: captured and recombined ones. Both: all three.
     ``keep_if`` is asked once the lock is held: when another process has meanwhile built what is
-    wanted, that is kept. Returns the manifest. Raises ``LibraryError`` when an input cannot be used
-    or the disk refuses.
+    wanted, that is kept. Returns the manifest. Raises ``LibraryError`` when an input cannot be
+    used, the disk refuses, or ``directory`` holds anything but a library.
     """
     if prior is None and mocap is None:
         raise ValueError("a library is built from a prior, from mocap or from both")
     report = progress or (lambda _stage, _fraction: None)
     try:
+        directory = landing(directory)
         with locked(directory, waiting=lambda: report("waiting for another build", 0.0)):
             if keep_if is not None and keep_if(directory):
                 return read_manifest(directory)

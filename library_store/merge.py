@@ -30,7 +30,7 @@ from library_store.cameras import COLUMNS
 from library_store.descriptor import DIMENSIONS
 from library_store.errors import LibraryError
 from library_store.manifest import FORMAT, Licence, Manifest, check_files, read_manifest
-from library_store.publish import locked, replacing
+from library_store.publish import landing, locked, replacing
 from library_store.sources import (
     FRAMES_FILE,
     MIRRORED,
@@ -68,15 +68,16 @@ def merge_libraries(
     index: IndexSettings | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Manifest:
-    """Merge the libraries in ``parts`` into one at ``directory``, replacing what is there.
+    """Merge the libraries in ``parts`` into one at ``directory``, replacing the one that is there.
 
     All files of the parts are checked first. Restartable and atomic as a build. Raises
-    ``LibraryError`` for a part that cannot be used, or that is given twice, ``ValueError`` for a
-    name that ids cannot have.
+    ``LibraryError`` for a part that cannot be used, or that is given twice, and where ``directory``
+    holds anything but a library, ``ValueError`` for a name that ids cannot have.
     """
     if not NAME_PATTERN.fullmatch(name):
         raise ValueError(f"library name {name!r} must match {NAME_PATTERN.pattern}")
     report = progress or (lambda _stage, _fraction: None)
+    directory = landing(directory)
     settings = index or IndexSettings()
     manifests = []
     for number, part in enumerate(parts):

@@ -18,10 +18,37 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from library_store.errors import LibraryError
+from library_store.manifest import CONTENT_FILES, MANIFEST
 from library_store.steps import flush
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
+
+
+def landing(directory: Path) -> Path:
+    """Where a library built at ``directory`` goes: links followed, so that a link stays one.
+
+    Raises ``LibraryError`` where something is that is not a library and would be lost.
+    """
+    target = directory.resolve()
+    if target.is_dir():
+        strangers = sorted(path.name for path in target.iterdir() if not _is_ours(path))
+        if not strangers:
+            return target
+        problem = f"is a directory that holds {', '.join(strangers[:3])}"
+    elif not target.exists():
+        return target
+    else:
+        problem = "is a file"
+    raise LibraryError(
+        f"{directory} {problem}, which is no part of a library and would be lost: build into a "
+        "directory that does not exist yet, is empty or holds a library"
+    )
+
+
+def _is_ours(path: Path) -> bool:
+    return path.name in (MANIFEST, *CONTENT_FILES) or path.name.startswith("index.")
 
 
 @contextmanager

@@ -71,7 +71,9 @@ def build(
         str | None,
         typer.Option(help="default, none or a file: sample from a prior; none with --from."),
     ] = None,
-    size: Annotated[int, typer.Option(min=1, help="How many exemplars.")] = DEFAULT_SIZE,
+    size: Annotated[
+        int, typer.Option(min=1, help="How many exemplars; of several cameras a pose, whole poses.")
+    ] = DEFAULT_SIZE,
     prior_share: Annotated[
         float, typer.Option(min=0, max=1, help="Share sampled where a prior joins --from.")
     ] = 0.5,
@@ -119,7 +121,7 @@ def build(
         wanted = BuildSettings(
             name=name or directory.name,
             n_poses=max(1, size // cameras_per_pose),
-            cameras_per_pose=cameras_per_pose,
+            cameras_per_pose=min(cameras_per_pose, size),
             seed=seed,
             version=version,
             index=index_settings(size, hnsw),
@@ -233,6 +235,8 @@ def print_info(
         return
     total_bytes = sum(file.bytes for file in manifest.files.values())
     table = Table(show_header=False, box=None)
+    table.add_column()
+    table.add_column(overflow="fold")
     for label, value in (
         ("library", f"{manifest.name} {manifest.version}"),
         ("directory", str(directory)),
@@ -241,7 +245,7 @@ def print_info(
             "on the disk",
             f"{total_bytes / 1e6:,.0f} MB, {total_bytes // manifest.n_exemplars} B each",
         ),
-        ("index", ", ".join(f"{key} {value}" for key, value in manifest.index.items())),
+        ("index", ", ".join(f"{key} {_compact(it)}" for key, it in manifest.index.items())),
         ("sha256", manifest.sha256),
         *((f"build: {name}", _compact(value)) for name, value in manifest.build.items()),
     ):

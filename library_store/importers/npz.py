@@ -84,6 +84,7 @@ def write(path: Path, clips: Sequence[Clip]) -> None:
             "(AMC with its ASF, BVH, C3D, Human3.6M CDF, npz)",
         )
     lengths = [len(clip) for clip in clips]
+    licences = sorted({clip.licence for clip in clips})  # of all, or a reader would take it so
     unfinished = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with unfinished.open("wb") as stream:
@@ -95,7 +96,7 @@ def write(path: Path, clips: Sequence[Clip]) -> None:
                 joint_names=np.array(LSP14.joint_names),
                 units=np.array("mm"),
                 up_axis=np.array("Y"),
-                license=np.array("; ".join(sorted({clip.licence for clip in clips} - {""}))),
+                license=np.array("; ".join(licences) if all(licences) else ""),
                 clip_name=np.array([clip.name for clip in clips]),
                 clip_subject=np.array([clip.subject for clip in clips]),
                 clip_action=np.array([clip.action for clip in clips]),

@@ -9,6 +9,7 @@ import numpy as np
 
 from library_store.importers import asf_amc, bvh, c3d, h36m, npz
 from library_store.importers.clip import Clip, MocapError
+from library_store.importers.joint_tables import read_mapping
 
 SUFFIXES = (".amc", ".bvh", ".c3d", ".cdf", ".npz")
 
@@ -51,8 +52,10 @@ def read_each(
 ) -> Iterator[Clip | MocapError]:
     """The clips of all files and folders one by one, and the error of each file that is skipped.
 
-    With ``strict`` the first such error is raised instead.
+    With ``strict`` the first such error is raised instead; that of a bad ``mapping`` always is.
     """
+    if mapping is not None:
+        read_mapping(mapping)
     for path in find_files(paths):
         try:
             yield from read(path, mapping=mapping)

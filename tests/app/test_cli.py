@@ -183,7 +183,9 @@ def test_library_import(tmp_path: Path) -> None:
 def test_library_commands(library_dir: Path, tmp_path: Path) -> None:
     info = run("library", "info", "--json", library_dir=library_dir)
     assert json.loads(info.stdout)["n_exemplars"] == 4000
-    assert "licence of CMU Graphics Lab" in run("library", "info", library_dir).stdout
+    said = run("library", "info", library_dir).stdout
+    assert "licence of CMU Graphics Lab" in said
+    assert json.loads(info.stdout)["sha256"] in "".join(said.split()), "folded, not cut"
     assert "whole" in run("library", "verify", library_dir=library_dir).stdout
     built = tmp_path / "tiny"
     done = run("library", "build", "--directory", built, "--size", 100)

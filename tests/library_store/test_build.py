@@ -235,6 +235,28 @@ def test_a_directory_that_cannot_be_written_is_named(prior: PosePrior, tmp_path:
         build_library(tmp_path / "file" / "library", prior, TINY)
 
 
+def test_what_is_no_library_is_never_replaced(prior: PosePrior, tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    (photos / "a.jpg").write_text("precious")
+    for target, problem in ((photos, "holds a.jpg"), (photos / "a.jpg", "is a file")):
+        with pytest.raises(LibraryError, match=rf"{target} .*{problem}.* would be lost"):
+            build_library(target, prior, TINY)
+    assert [path.name for path in tmp_path.rglob("*")] == ["photos", "a.jpg"]
+    (photos / "a.jpg").unlink()
+    build_library(photos, prior, TINY)
+    verify_library(photos)
+
+
+def test_a_link_stays_a_link(tiny: Path, prior: PosePrior, tmp_path: Path) -> None:
+    link = tmp_path / "current"
+    link.symlink_to(tiny)
+    for seed in (1, 2, 2):
+        build_library(link, prior, replace(TINY, seed=seed))
+        assert link.readlink() == tiny
+        assert verify_library(tiny).build["seed"] == seed
+
+
 def test_without_an_atomic_exchange_the_old_is_moved_aside(
     tiny: Path, prior: PosePrior, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -131,6 +131,9 @@ def test_parts_that_cannot_be_merged(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="must match"):
         merge_libraries(out, [first, folder / "second"], name="a b")
     assert not out.exists()
+    (tmp_path / "a.jpg").write_text("precious")
+    with pytest.raises(LibraryError, match=r"holds a\.jpg, .* would be lost"):
+        merge_libraries(tmp_path, [first, folder / "second"], name="both")
 
 
 def test_a_contact_sheet_shows_what_is_asked_for(merged: Library) -> None:

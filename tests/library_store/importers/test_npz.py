@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from numpy.testing import assert_allclose
 from library_store.anatomy import Float, root_of
 from library_store.importers import Clip, MocapError, read
 from library_store.importers.h36m import H36M_32
-from library_store.importers.npz import H36M_17, HUMANEVA_15, SMPL, write
+from library_store.importers.npz import H36M_17, HUMANEVA_15, SMPL, states_licence, write
 from library_store.skeleton import HEAD_TOP, LSP14, NECK
 from tests.library_store.importers.files import nested, people
 
@@ -113,6 +114,17 @@ def test_generic_files_are_written_and_read(tmp_path: Path, poses: Float) -> Non
         assert_allclose(clip.frames, other.frames)
     with np.load(path) as held:  # nothing in it needs a pickle
         assert str(held["license"]) == "free; own"
+
+
+def test_a_clip_without_a_licence_does_not_get_that_of_another(
+    tmp_path: Path, poses: Float
+) -> None:
+    positions, frames = poses.astype(np.float32), np.arange(len(poses))
+    stated = Clip("a", "", "", 30.0, positions, frames, licence="free for all uses")
+    path = tmp_path / "clips.npz"
+    write(path, [stated, replace(stated, name="b", licence="")])
+    assert [clip.licence for clip in read(path)] == ["free for all uses", ""]
+    assert not states_licence(path)
 
 
 def test_what_cannot_be_written_is_named(tmp_path: Path, poses: Float) -> None:

@@ -32,6 +32,13 @@ def test_strict_refuses_it(folder: Path) -> None:
         read_all([folder], strict=True)
 
 
+def test_a_bad_mapping_file_is_not_every_files_fault(folder: Path) -> None:
+    mapping = folder / "mapping.json"
+    mapping.write_text("{}")
+    with pytest.raises(MocapError, match=r"mapping\.json: joints missing"):
+        read_all([folder], mapping=mapping)
+
+
 def test_files_of_other_kinds_and_missing_ones(folder: Path) -> None:
     with pytest.raises(LibraryError, match=r"notes\.txt: not a kind of file"):
         read(folder / "notes.txt")
