@@ -7,6 +7,7 @@
     └── RequestError                 one request cannot be answered; becomes problem+json
         ├── EmptyBodyError               400
         ├── MalformedBodyError           400
+        ├── PreflightRefusedError        400
         ├── UnauthorizedError            401
         ├── ExemplarNotFoundError        404
         ├── UploadTooSlowError           408
@@ -87,6 +88,14 @@ class MalformedBodyError(RequestError):
     status = 400
     slug = "malformed-body"
     title = "Malformed body"
+
+
+class PreflightRefusedError(RequestError):
+    """A page of another origin asked for what ``POSEMATCH_CORS_ORIGINS`` does not allow."""
+
+    status = 400
+    slug = "preflight-refused"
+    title = "Cross-origin request refused"
 
 
 class UnauthorizedError(RequestError):

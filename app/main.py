@@ -16,9 +16,9 @@ from pathlib import Path
 
 from fastapi import FastAPI
 from starlette.middleware import Middleware
-from starlette.middleware.cors import CORSMiddleware
 
 from app.api import exemplars, health, info, lift, metrics, page, poses, problems
+from app.api.cors import CorsMiddleware
 from app.api.deps import Service
 from app.api.openapi import DESCRIPTION, openapi_document
 from app.api.shedding import SheddingMiddleware
@@ -94,7 +94,7 @@ def create_app(
     if settings.cors_origins:
         middleware.append(
             Middleware(
-                CORSMiddleware,
+                CorsMiddleware,
                 allow_origins=settings.cors_origins,
                 allow_methods=["GET", "POST"],
                 allow_headers=["Authorization", "Content-Type", "X-API-Key", "X-Request-ID"],

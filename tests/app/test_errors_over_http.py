@@ -178,6 +178,22 @@ def test_cors_is_an_allow_list(keyed_server: Server, server: Server) -> None:
     assert "access-control-allow-origin" not in closed.headers, "off by default"
 
 
+def test_preflights(keyed_server: Server) -> None:
+    asked = {"Origin": "https://example.org", "Access-Control-Request-Method": "POST"}
+    fine = keyed_server.client.options("/v1/poses", headers=asked)
+    assert fine.status_code == 200
+    assert fine.headers["access-control-allow-origin"] == "https://example.org"
+    for more, named in (
+        ({"Origin": "https://example.com"}, "origin"),
+        ({"Access-Control-Request-Method": "DELETE"}, "method"),
+        ({"Access-Control-Request-Headers": "X-Other"}, "headers"),
+    ):
+        refused = keyed_server.client.options("/v1/poses", headers=asked | more)
+        problem(refused, 400, "preflight-refused")
+        assert named in refused.json()["detail"]
+        assert "origin" in refused.headers["vary"].lower()
+
+
 def test_unknown_and_wrong_verb(server: Server) -> None:
     problem(server.client.get("/v2/poses"), 404, "not-found")
     for name in ("nope", "small:sampled:x:1:1", "small:sampled:x:9" + 40 * "9" + ":1", "%00"):
