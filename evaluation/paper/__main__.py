@@ -13,6 +13,7 @@ the people they are measured on. Prints Markdown; ``--out`` keeps it, with the f
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -55,7 +56,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     if not Path(chosen.data).is_dir():
         parser.error(f"--data {chosen.data} is no folder")
-    run_users_data(Path(chosen.data), options)
+    if not run_users_data(Path(chosen.data), options):
+        sys.exit(f"posematch evaluate paper: no table can be made of what is in {chosen.data}")
 
 
 if __name__ == "__main__":

@@ -101,8 +101,8 @@ class Protocols:
     by_action: bool
 
 
-def run_users_data(root: Path, options: Options) -> None:
-    """Human3.6M and HumanEva-I, as far as they are under ``root``."""
+def run_users_data(root: Path, options: Options) -> bool:
+    """Human3.6M and HumanEva-I, as far as they are under ``root``; whether there is any table."""
     told = Report(options.out)
     h36m, humaneva = find_h36m(root), find_humaneva(root)
     told.missing += h36m.missing + humaneva.missing
@@ -146,6 +146,7 @@ def run_users_data(root: Path, options: Options) -> None:
     elif humaneva.scenes:
         told.missing.append("table 9: needs Human3.6M, to learn from")
     told.close()
+    return library is not None
 
 
 def run_cmu(mocap: Path, cross_set: Path | None, noise_px: float, options: Options) -> None:

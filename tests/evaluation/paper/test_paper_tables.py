@@ -75,7 +75,8 @@ def test_without_cameras_and_videos_the_rest_is_done(tmp_path: Path) -> None:
 
 
 def test_an_empty_folder_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    main(["--data", str(tmp_path), "--out", str(tmp_path / "out")])
+    with pytest.raises(SystemExit, match="no table can be made"):
+        main(["--data", str(tmp_path), "--out", str(tmp_path / "out")])
     assert "Human3.6M: no data_3d_h36m.npz" in capsys.readouterr().out
 
 

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 
 from library_store.anatomy import Float, root_of, unit
 from library_store.importers import Clip, MocapError
-from library_store.importers.checks import MM_PER_UNIT, checked
+from library_store.importers.checks import MAX_SPEED_MM_S, MM_PER_UNIT, checked
 from library_store.skeleton import (
     L_ELBOW,
     L_KNEE,
@@ -134,6 +134,32 @@ def test_glitches_are_dropped(standing: Float) -> None:
     mixed[1::4, L_ELBOW] += 900.0
     with pytest.raises(MocapError, match="no one skeleton"):
         checked(FILE, clip_of(mixed))
+
+
+def test_a_throw_is_no_glitch(standing: Float) -> None:
+    """Faster than 15 m/s, but there is no way back."""
+    poses, axis = standing.copy(), np.array([0.0, 0.0, 1.0])
+    forearm = poses[:, R_WRIST] - poses[:, R_ELBOW]
+    across = unit(np.cross(axis, forearm)) * np.linalg.norm(forearm, axis=-1, keepdims=True)
+    angle = np.clip(np.arange(len(poses)) - 9, 0, 3)[:, None] * 0.6
+    poses[:, R_WRIST] = poses[:, R_ELBOW] + np.cos(angle) * forearm + np.sin(angle) * across
+    step = np.linalg.norm(np.diff(poses[:, R_WRIST], axis=0), axis=-1)[9:12]
+    assert (step * 120.0 > MAX_SPEED_MM_S).all()
+    assert len(checked(FILE, clip_of(poses, rate_hz=120.0))) == len(poses)
+
+
+@pytest.mark.parametrize(("n", "refused"), [(9, False), (12, True)])
+def test_a_clip_that_loses_most_of_its_frames_is_refused(
+    standing: Float, n: int, refused: bool
+) -> None:
+    poses = standing.copy()
+    poses[5 : 5 + n, R_ELBOW] += 500.0
+    poses[20 : 20 + n, L_ELBOW] += 500.0
+    if refused:
+        with pytest.raises(MocapError, match="24 of 40 frames"):
+            checked(FILE, clip_of(poses))
+    else:
+        assert len(checked(FILE, clip_of(poses))) == 40 - 2 * n
 
 
 def test_a_t_pose_as_the_first_frame_is_dropped(standing: Float) -> None:
