@@ -8,7 +8,7 @@ from library_store.cell_index import CellIndex, ScanSettings
 from library_store.descriptor import normalise, weighted_distance
 from library_store.exact import ExactIndex
 from library_store.library import Library
-from library_store.masked import Correlation, missing_limbs
+from library_store.masked import Correlation, missing_limbs, nearest_masked
 from library_store.neighbours import Neighbours
 from library_store.skeleton import (
     HEAD_TOP,
@@ -51,6 +51,18 @@ def exact(table: np.ndarray) -> ExactIndex:
 def cells(table: np.ndarray) -> CellIndex:
     """Scans a part of this small library, whose neighbours are far apart."""
     return CellIndex.build(table, 20, ScanSettings(scanned=2_000, per_neighbour=0))
+
+
+def test_equally_near_entries_come_in_order(table: np.ndarray) -> None:
+    """Whatever order a scan found them in, so that answers are the same on every machine."""
+    rng = np.random.default_rng(0)
+    entries = rng.permutation(600)
+    rows = np.where(entries % 2 == 0, 7, 11)
+    weights = np.ones(14)
+    weights[R_WRIST] = 0.0
+    query = normalise(table[7].reshape(14, 2), weights)
+    found = nearest_masked(table[rows], entries, query, weights, 40)
+    assert_array_equal(found.entries, np.arange(0, 80, 2))
 
 
 def noisy_queries(table: np.ndarray, n: int) -> np.ndarray:

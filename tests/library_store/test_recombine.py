@@ -55,14 +55,22 @@ def test_spread_of_proportions() -> None:
     assert factors.mean(axis=1).std() == pytest.approx(np.hypot(0.05, 0.03 / 8**0.5), rel=0.02)
 
 
-def drawn(poses: Float, limits: Limits, seed: int = 1, n: int = 500, **spread: float) -> Recombined:
+def drawn(
+    poses: Float,
+    limits: Limits,
+    seed: int = 1,
+    n: int = 500,
+    *,
+    may_mirror: bool = True,
+    **spread: float,
+) -> Recombined:
     return recombine(
         poses.astype(np.float32),
         measure_lengths(poses),
         n,
         np.random.default_rng(seed),
         limits=limits,
-        may_mirror=True,
+        may_mirror=may_mirror,
         **({"stature_sd": 0.05, "bone_sd": 0.03} | spread),
     )
 
@@ -83,6 +91,12 @@ def test_recombined_poses_name_their_parts_and_keep_the_limits(poses: Float) -> 
     own = measure_lengths(legs)
     trunk = LENGTHS.index("trunk")
     assert_allclose(measure_lengths(result.poses)[:, trunk], own[:, trunk], rtol=1e-5)
+
+
+def test_nothing_is_mirrored_where_that_is_not_wanted(poses: Float) -> None:
+    result = drawn(poses, learn_limits(poses, 0.02), may_mirror=False, stature_sd=0.0, bone_sd=0.0)
+    assert not result.mirrored.any()
+    assert_allclose(result.poses[:, R_HIP:], poses[result.rows[:, 0]][:, R_HIP:], atol=1e-3)
 
 
 def test_limits_that_refuse_all_are_an_error(poses: Float) -> None:
