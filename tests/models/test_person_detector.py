@@ -1,6 +1,11 @@
+from pathlib import Path
+
+import cv2
 import numpy as np
 
-from models.person_detector import decode, iou
+from models.person_detector import PersonDetector, decode, iou
+
+PHOTO = Path(__file__).parents[1] / "data" / "renders" / "014.jpg"
 
 UNIT = 32.0
 
@@ -43,3 +48,24 @@ def test_best_first() -> None:
 def test_iou_of_itself_is_one_and_of_strangers_zero() -> None:
     boxes = np.array([[0.0, 0.0, 10.0, 10.0], [20.0, 20.0, 30.0, 40.0]])
     np.testing.assert_allclose(iou(boxes, boxes), np.eye(2))
+
+
+def test_boxes_are_in_the_pixels_of_the_photo_given() -> None:
+    """A photo of every pixel four times is the same photo: pixel x becomes 2 x and 2 x + 1."""
+    photo = cv2.imread(str(PHOTO))
+    assert photo is not None
+    scale = 320 / max(photo.shape[:2])
+    small = np.asarray(cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+    assert max(small.shape[:2]) == 320
+    framed = np.zeros(small.shape, np.uint8)  # away from the edge, where boxes end
+    half = cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    top, left = (np.array(small.shape[:2]) - half.shape[:2]) // 2
+    framed[top : top + half.shape[0], left : left + half.shape[1]] = half
+    detector = PersonDetector(provider="cpu")
+    (box,) = detector.detect(framed, 1, threshold=0.05)
+    (other,) = detector.detect(framed.repeat(2, axis=0).repeat(2, axis=1), 1, threshold=0.05)
+    first = np.array([box.x_px, box.y_px])
+    assert min(first) > 1
+    np.testing.assert_allclose([other.x_px, other.y_px], (first + 0.5) * 2 - 0.5, atol=1e-3)
+    size = np.array([box.width_px, box.height_px])
+    np.testing.assert_allclose([other.width_px, other.height_px], 2 * size, rtol=1e-5)
