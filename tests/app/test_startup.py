@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import shutil
+import signal
 import socket
 import subprocess
 import threading
@@ -40,6 +41,18 @@ def refusal(tmp_path: Path, port: int = 0, **settings: object) -> str:
 def test_bad_settings(tmp_path: Path) -> None:
     assert "POSEMATCH_WORKERS" in refusal(tmp_path, workers=0)
     assert "POSEMATCH_WORKERS" in refusal(tmp_path, worker=1), "a hint at the right name"
+
+
+def test_control_c_while_it_still_imports() -> None:
+    command: list[str | Path] = [COMMAND, "serve", "--port", "0"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        loaded = Path(f"/proc/{process.pid}/maps")
+        while "numpy" not in loaded.read_text():
+            time.sleep(0.005)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert said == ""
+    assert process.returncode == -signal.SIGINT, "which a shell calls 130"
 
 
 def test_an_address_that_is_taken(tmp_path: Path, library_dir: Path) -> None:
