@@ -173,8 +173,10 @@ class Admission:
         now_s = time.monotonic()
         backlog_s = 0.0
         for job in self._jobs.values():
-            spent_s = 0.0 if job.began_s is None else now_s - job.began_s
-            backlog_s += max(0.0, job.cost_s - spent_s)
+            if job.began_s is None:
+                backlog_s += job.cost_s
+            else:
+                backlog_s += max(0.0, job.cost_s - (now_s - job.began_s))
         wait_s = backlog_s / self._workers
         slack_s = at_s + self._deadline_s - usual.at_most_s - now_s
         if self.waiting >= self._queue_size:

@@ -11,7 +11,8 @@ an answer that the client does not take   closed after ``patience_s``
 
 Under overload nearly all requests are refused, and what a refusal costs is taken from the answers:
 those that can be given from the request's head alone (``app.api.shedding``) are written from here,
-without a task and a walk through the application.
+without a task and a walk through the application. And no answer is sent with Python's lock held
+(``_Sender``): who is woken by it may take the processor, and all workers would wait.
 
 The errors of the table arise before there is a request, so they are written here, as problem+json
 like all others and with a request id of their own, which the log has too.
@@ -22,10 +23,12 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import os
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from http import HTTPStatus
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 from starlette.types import Scope
 from uvicorn._types import ASGI3Application
@@ -53,7 +56,8 @@ class Connection(HttpToolsProtocol):
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start waiting for the first head."""
-        super().connection_made(transport)
+        plain = transport.get_extra_info("sslcontext") is None
+        super().connection_made(_Sender(transport, self.loop) if plain else transport)
         self._timers: dict[str, asyncio.TimerHandle] = {}
         self._running: RequestResponseCycle | None = None
         self._head_bytes = 0
@@ -171,6 +175,66 @@ class Connection(HttpToolsProtocol):
             if cycle is not None:
                 cycle.disconnected = True
                 cycle.message_event.set()
+
+
+class _Sender(asyncio.Transport):
+    """A transport that sends what one turn of the event loop writes in one go, without the lock.
+
+    uvloop's own holds Python's lock while the kernel delivers the data, which on one machine may
+    well include the receiver's turn.
+    """
+
+    def __init__(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop) -> None:
+        super().__init__()
+        self._transport = transport
+        self._loop = loop
+        self._socket: int = transport.get_extra_info("socket").fileno()
+        self._written: list[bytes] = []
+
+    def write(self, data: bytes | bytearray | memoryview[Any]) -> None:
+        """Send ``data`` before the loop's next turn."""
+        if not self._written:
+            self._loop.call_soon(self._send)
+        self._written.append(bytes(data))
+
+    def close(self) -> None:
+        """Send what is written, then close."""
+        self._send()
+        self._transport.close()
+
+    def abort(self) -> None:
+        """Close at once."""
+        self._written.clear()
+        self._transport.abort()
+
+    def is_closing(self) -> bool:
+        """Whether the connection is closed or about to be."""
+        return self._transport.is_closing()
+
+    def pause_reading(self) -> None:
+        """Receive no more for now."""
+        self._transport.pause_reading()
+
+    def resume_reading(self) -> None:
+        """Receive again."""
+        self._transport.resume_reading()
+
+    def get_extra_info(self, name: str, default: Any = None) -> Any:
+        """What the transport knows of its connection."""
+        return self._transport.get_extra_info(name, default)
+
+    def _send(self) -> None:
+        data = b"".join(self._written)
+        self._written.clear()
+        if not data or self._transport.is_closing():
+            return
+        sent = 0
+        if not self._transport.get_write_buffer_size():
+            # What the socket does not take, its transport waits for; so it does with its errors.
+            with suppress(OSError):
+                sent = os.write(self._socket, data)
+        if sent < len(data):
+            self._transport.write(data[sent:])
 
 
 def connection_class(patience_s: float, early_answer: EarlyAnswer) -> type[Connection]:

@@ -9,7 +9,7 @@ import sys
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import BinaryIO, Self
 
 import httpx
 
@@ -110,3 +110,13 @@ def read_response(connection: socket.socket) -> tuple[int, bytes]:
             break
         body += piece
     return int(head.split(b" ")[1]), body
+
+
+def read_whole(stream: BinaryIO) -> tuple[int, dict[str, str], bytes]:
+    """One response: status, headers, body."""
+    status = int(stream.readline().split(b" ")[1])
+    headers = {}
+    while line := stream.readline().rstrip(b"\r\n").decode():
+        name, _, value = line.partition(": ")
+        headers[name.lower()] = value
+    return status, headers, stream.read(int(headers["content-length"]))

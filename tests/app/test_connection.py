@@ -12,7 +12,7 @@ import pytest
 from app.api.bodies import UploadMemory
 from app.connection import MAX_HEAD_BYTES
 from app.errors import OverloadedError
-from tests.app.server import Server, read_response
+from tests.app.server import Server, read_response, read_whole
 
 PATIENCE_S = 1.5
 """The upload timeout of the session's server."""
@@ -131,6 +131,21 @@ def test_who_does_not_read_is_cut_off(server: Server) -> None:
         assert received < 100 * 80_000
     assert server.client.get("/livez").status_code == 200
     assert "Traceback" not in server.log.read_text(), "a connection given up is no error"
+
+
+def test_who_reads_slowly_gets_everything_in_order(server: Server) -> None:
+    """Answers larger than the socket's buffers, several at once."""
+    expected = server.client.get("/openapi.json").content
+    with socket.socket() as connection:
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        connection.connect(("127.0.0.1", server.port))
+        connection.sendall(20 * b"GET /openapi.json HTTP/1.1\r\nHost: x\r\n\r\n" + LIVEZ)
+        with connection.makefile("rb") as stream:
+            for _ in range(20):
+                time.sleep(0.02)
+                status, _, body = read_whole(stream)
+                assert (status, body) == (200, expected)
+            assert read_whole(stream)[0] == 200
 
 
 def test_old_and_odd_clients(server: Server, photo: bytes) -> None:

@@ -7,7 +7,7 @@ import json
 import threading
 import time
 from contextlib import ExitStack
-from typing import Any, BinaryIO
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,20 +16,10 @@ from app.admission import Arrival
 from app.api.deps import Service
 from app.api.shedding import EarlyRefusals
 from app.settings import load_settings
-from tests.app.server import Server
+from tests.app.server import Server, read_whole
 
 LIVEZ = b"GET /livez HTTP/1.1\r\nHost: x\r\n\r\n"
 REFUSED = 'posematch_requests_total{method="POST",route="/v1/poses",status="503"}'
-
-
-def read_whole(stream: BinaryIO) -> tuple[int, dict[str, str], bytes]:
-    """One response: status, headers, body."""
-    status = int(stream.readline().split(b" ")[1])
-    headers = {}
-    while line := stream.readline().rstrip(b"\r\n").decode():
-        name, _, value = line.partition(": ")
-        headers[name.lower()] = value
-    return status, headers, stream.read(int(headers["content-length"]))
 
 
 def test_a_refusal_from_the_head_is_as_complete_as_any_other(narrow_server: Server) -> None:
