@@ -2,13 +2,14 @@
 
 Keypoints are taken by their names in ``categories[*].keypoints``: shoulders, elbows, wrists, hips,
 knees and ankles with ``left_``/``right_`` (or ``l_``/``r_``) before them, and ``neck`` and
-``head_top`` where there are any; others (eyes, ears, toes) are left out. Visibility is COCO's:
-0 not labelled, 1 labelled but hidden, 2 seen. Pixels are those of the stored file, whatever its
-EXIF orientation says.
+``head_top`` where there are any; others (eyes, ears, toes) are left out, and so are categories
+without these limbs. Visibility is COCO's: 0 not labelled, 1 labelled but hidden, 2 seen. Pixels are
+those of the stored file, whatever its EXIF orientation says.
 """
 
 from __future__ import annotations
 
+import codecs
 import re
 from pathlib import Path
 from typing import Annotated
@@ -64,13 +65,19 @@ def read_coco(annotations: Path, images: Path) -> list[LabelledCrop]:
     not COCO's, an image that is missing or of another size, coordinates that cannot be pixels.
     """
     coco = _parse(annotations)
-    columns = {c.id: _columns(annotations, c) for c in coco.categories if c.keypoints}
+    columns = _columns_by_category(annotations, coco)
     if not columns:
         raise AnnotationError(
             f"{annotations}: no category has keypoints; is it a file of boxes only? "
             "person_keypoints_*.json is wanted"
         )
-    files = {image.id: image for image in coco.images}
+    files: dict[int, _Image] = {}
+    for image in coco.images:
+        if files.setdefault(image.id, image).file_name != image.file_name:
+            raise AnnotationError(
+                f"{annotations}: image {image.id} is {files[image.id].file_name} and again "
+                f"{image.file_name}; whose are its labels?"
+            )
     people: dict[int, list[tuple[str, NDArray[np.float64]]]] = {}
     for index, record in enumerate(coco.annotations):
         name = f"annotation {index if record.id is None else record.id}"
@@ -120,7 +127,7 @@ def cut_out(
 
 def _parse(path: Path) -> _Coco:
     try:
-        return _Coco.model_validate_json(path.read_bytes())
+        return _Coco.model_validate_json(path.read_bytes().removeprefix(codecs.BOM_UTF8))
     except FileNotFoundError:
         raise AnnotationError(f"{path}: there is no such file") from None
     except ValidationError as error:
@@ -130,6 +137,21 @@ def _parse(path: Path) -> _Coco:
             f"{path} is no COCO keypoints file: {where}: {first['msg']}; wanted are images, "
             "annotations and categories as on cocodataset.org/#format-data"
         ) from None
+
+
+def _columns_by_category(path: Path, coco: _Coco) -> dict[int, dict[int, int]]:
+    """By category, which keypoint is which joint; those that are no people (dogs) left out."""
+    found: dict[int, dict[int, int]] = {}
+    problems: list[AnnotationError] = []
+    for category in coco.categories:
+        if category.keypoints:
+            try:
+                found[category.id] = _columns(path, category)
+            except AnnotationError as error:
+                problems.append(error)
+    if problems and not found:
+        raise problems[0]
+    return found
 
 
 def _columns(path: Path, category: _Category) -> dict[int, int]:
@@ -184,10 +206,11 @@ def _read_image(annotations: Path, folder: Path, record: _Image) -> Image:
     if pixels is None:
         raise AnnotationError(f"{path} is no image that can be decoded")
     height, width = pixels.shape[:2]
-    if record.width is not None and (record.width, record.height) != (width, height):
+    stated = record.width or width, record.height or height
+    if stated != (width, height):
         raise AnnotationError(
             f"{path} is {width}x{height} px, but {annotations} labelled an image of "
-            f"{record.width}x{record.height}: it was resized or turned since"
+            f"{stated[0]}x{stated[1]}: it was resized or turned since"
         )
     return np.asarray(pixels, np.uint8)
 

@@ -53,6 +53,25 @@ def test_names_are_understood_in_other_spellings(tmp_path: Path) -> None:
     assert crops[0].weight[JOINT["head_top"]] == 1
 
 
+def test_what_does_not_matter_is_passed_over(tmp_path: Path) -> None:
+    records = user_files.coco(tmp_path / "images")
+    path = user_files.write(tmp_path / "labels.json", records)
+    wanted = read_coco(path, tmp_path / "images")
+    records["images"][0].pop("height", None)
+    records["images"].append({"id": 99, "file_name": "not-there.jpg"})
+    records["categories"].append({"id": 7, "name": "dog", "keypoints": ["nose", "tail"]})
+    person = records["annotations"][0]
+    records["annotations"] += [
+        {"id": 90, "image_id": 0, "category_id": 7, "keypoints": [5, 5, 2, 6, 6, 2]},
+        {"id": 91, "image_id": 0, "category_id": person["category_id"], "bbox": [0, 0, 0, 0]},
+        person | {"id": 92, "iscrowd": 1, "segmentation": {"counts": [1, 2], "size": [1, 2]}},
+    ]
+    user_files.write(path, records)
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    found = read_coco(path, tmp_path / "images")
+    assert [crop.name for crop in found] == [crop.name for crop in wanted]
+
+
 def _set(index: int, value: float) -> Callable[[Records], None]:
     def change(records: Records) -> None:
         records["annotations"][0]["keypoints"][index] = value
@@ -83,6 +102,14 @@ DAMAGE: dict[str, tuple[Callable[[Records], object], str]] = {
     "outside": (_set(3, 5000.0), r"annotation 0 has a keypoint at \(5000,.*320x240"),
     "normalised": (_normalised, "lie within 0..1"),
     "image gone": (lambda r: r["images"][0].update(file_name="x.png"), "does not exist"),
+    "an image twice": (
+        lambda r: r["images"].append(dict(r["images"][0], file_name="1.png")),
+        "image 0 is 0.png and again 1.png",
+    ),
+    "resized in width": (
+        lambda r: (r["images"][0].update(width=640), r["images"][0].pop("height", None)),
+        "an image of 640x240: it was resized",
+    ),
     "resized": (lambda r: r["images"][0].update(width=640, height=480), "resized or turned"),
     "unknown image": (lambda r: r["images"].pop(0), "image 0, which is not among images"),
     "nobody": (lambda r: r["annotations"].clear(), "nothing to learn"),
