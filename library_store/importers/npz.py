@@ -39,6 +39,8 @@ SMPL = (15, 12, 17, 19, 21, 16, 18, 20, 2, 5, 8, 1, 4, 7)
 
 HUMANEVA_HZ = 60.0
 _MM_PER_M = 1000.0
+_LAST_FRAME = 2**31 - 1
+"""Libraries keep frame numbers in four bytes."""
 
 _CLIP_COLUMNS = ("name", "subject", "action", "fps", "findings", "license")
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
@@ -132,6 +134,8 @@ def _read_generic(path: Path, npz: NpzFile) -> list[Clip]:
         positions = positions[:, [names.index(name) for name in LSP14.joint_names]]
     number = _column(path, npz, "clip", n, np.zeros(n, dtype=np.int64))
     frame = _column(path, npz, "frame", n, np.arange(n))
+    if frame.min() < 0 or frame.max() > _LAST_FRAME:
+        raise MocapError(path, f"frames {frame.min()} to {frame.max()} are no frame numbers")
     up_axis = npz.text("up_axis").upper()
     positions, up_is_known = _with_y_up(path, positions, up_axis)
     columns = {name: npz.column(f"clip_{name}") for name in _CLIP_COLUMNS}

@@ -62,7 +62,7 @@ def import_caffe(
     anything is written.
     """
     try:
-        text = prototxt.read_text("utf-8")
+        text = prototxt.read_text("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise CaffeError(f"{prototxt} cannot be read as text: {error}") from error
     weights = read_caffemodel(caffemodel)

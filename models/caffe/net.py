@@ -1,6 +1,7 @@
 """A deploy prototxt as layers with the parameters that matter, checked; new and old spelling.
 
-Layers that only training has (``include { phase: TRAIN }``) are left out.
+Layers that only training has (``include { phase: TRAIN }``, ``exclude { phase: TEST }``) are left
+out.
 """
 
 from __future__ import annotations
@@ -95,7 +96,12 @@ def read_net(text: str) -> Net:
     layers = []
     for message in messages:
         name = message.text("name", message.where)
-        if any(rule.text("phase") == "TRAIN" for rule in message.messages.get("include", [])):
+        only_trained = (("include", "TRAIN"), ("exclude", "TEST"))
+        if any(
+            rule.text("phase") == phase
+            for word, phase in only_trained
+            for rule in message.messages.get(word, [])
+        ):
             continue
         kind = message.text("type")
         tops = tuple(message.texts("top"))

@@ -157,6 +157,8 @@ def test_generic_files_in_another_joint_order(tmp_path: Path, poses: Float) -> N
         ({"positions": np.zeros((0, 14, 3))}, "wanted is"),
         ({"positions": np.array(["a"])}, "numbers"),
         ({"positions": np.ones((4, 14, 3)), "clip": np.zeros(3, int)}, "clip must be 4"),
+        ({"positions": np.ones((4, 14, 3)), "frame": np.arange(4) - 1}, "no frame numbers"),
+        ({"positions": np.ones((4, 14, 3)), "frame": np.arange(4) + 2**31}, "no frame numbers"),
         ({"positions": np.ones((4, 14, 3)), "clip_fps": np.array(["fast"])}, "clip_fps 'fast'"),
         ({"positions": np.ones((4, 14, 3)), "clip_name": np.array("a")}, "one dimension"),
         (

@@ -137,7 +137,8 @@ def test_input_layers_separate_inputs_and_training_layers_are_understood(tmp_pat
         for name, n in (("image", 3), ("center_map", 1))
     )
     training = 'layer { name: "loss" type: "EuclideanLoss" include { phase: TRAIN } }\n'
-    prototxt.write_text(several + body + training)
+    training += 'layer { name: "acc" type: "Accuracy" exclude: { phase: TEST } }  # "}" no end\n'
+    prototxt.write_bytes(("\ufeff" + several + body + training).replace("\n", "\r\n").encode())
     given = import_caffe(prototxt, caffemodel, tmp_path / "b")
     batch = images(2, SIDE_PX)
     np.testing.assert_array_equal(
