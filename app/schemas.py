@@ -34,6 +34,9 @@ MAX_CANDIDATES = 50
 MAX_COORDINATE_PX = 1e6
 MAX_GIVEN_JOINTS = max(c.skeleton.n_joints for c in CONVERSIONS.values())
 
+CoordinatePx = Annotated[
+    float, Field(ge=-MAX_COORDINATE_PX, le=MAX_COORDINATE_PX, allow_inf_nan=False)
+]
 FocalLengthPx = Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
 SubjectHeightMm = Annotated[float, Field(ge=300, le=3000, allow_inf_nan=False)]
 Candidates = Annotated[int, Field(ge=0, le=MAX_CANDIDATES)]
@@ -257,8 +260,8 @@ class GivenJoint(Given):
     """A 2D joint to lift; confidence 0 means that it is missing."""
 
     name: str
-    x_px: float = Field(ge=-MAX_COORDINATE_PX, le=MAX_COORDINATE_PX)
-    y_px: float = Field(ge=-MAX_COORDINATE_PX, le=MAX_COORDINATE_PX)
+    x_px: CoordinatePx
+    y_px: CoordinatePx
     confidence: float = Field(1.0, ge=0, le=1)
 
 

@@ -50,7 +50,9 @@ class PoseParameters(schemas.Given):
         "fusion", description="`paper` is the method of Chen & Ramanan (2017) to the letter."
     )
     skeleton: schemas.AnswerSkeleton = Field(
-        "lsp14", description="In whose joints to answer. Joints that lsp14 does not give are null."
+        "lsp14",
+        description="In whose joints to answer. Joints that lsp14 does not give are left out of "
+        "lists by name and null in `joints_mm`.",
     )
     box_px: str | None = Field(
         None,

@@ -340,7 +340,8 @@ class PoseParameters(TypedDict):
     candidates: NotRequired[int]
     # `paper` is the method of Chen & Ramanan (2017) to the letter.
     method: NotRequired[Literal["fusion", "paper"]]
-    # In whose joints to answer. Joints that lsp14 does not give are null.
+    # In whose joints to answer. Joints that lsp14 does not give are left out of lists by name and
+    # null in `joints_mm`.
     skeleton: NotRequired[Literal["lsp14", "coco17", "h36m17"]]
     # `x,y,w,h`: the extent of the one person to look at; skips detection.
     box_px: NotRequired[str | Sequence[float]]

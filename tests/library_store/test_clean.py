@@ -36,6 +36,17 @@ def test_people_lying_and_upside_down_have_one_heading_too() -> None:
         assert_allclose(again, ahead, atol=1e-6)
 
 
+def test_somebody_on_their_side_does_not_flip(prior: PosePrior) -> None:
+    """The hip axis is vertical then: what little it leans must not decide."""
+    laid = face_ahead(prior.sample(20, np.random.default_rng(1)))
+    laid[:, R_HIP], laid[:, L_HIP] = (-100.0, 0.0, 0.0), (100.0, 0.0, 0.0)
+    laid = laid @ about_axis("z", np.array(90.0)).T
+    one, other = laid.copy(), laid.copy()
+    one[:, L_HIP, 2] += 1.0
+    other[:, L_HIP, 2] -= 1.0
+    assert_allclose(face_ahead(one), face_ahead(other), atol=60.0)
+
+
 def test_mirroring_keeps_the_heading() -> None:
     ahead = face_ahead(moving(50, 2))
     mirrored = ahead[:, LSP14.mirror] * np.array([-1.0, 1.0, 1.0])
