@@ -39,3 +39,17 @@ def test_the_suspect_is_whom_plain_densities_accuse(elsewhere_px: float) -> None
     found = Evidence(prior, innovation, NOISE_VAR).suspect(np.ones(n), prior_wrong)
     assert found == wanted
     assert found == (3 if elsewhere_px else None)
+
+
+def test_whom_the_network_doubts_is_suspected_sooner() -> None:
+    n = 6
+    innovation = np.zeros(2 * n)
+    innovation[4:6] = 18.0
+    evidence = Evidence(4.0 * np.eye(2 * n), innovation, np.array([36.0]))
+    sure = np.full(n, 0.99)
+    assert evidence.suspect(sure, 0.001) is None
+    doubted = sure.copy()
+    doubted[2] = 0.3
+    assert evidence.suspect(doubted, 0.001) == 2
+    doubted[[2, 3]] = 0.99, 0.3
+    assert evidence.suspect(doubted, 0.001) is None, "it is where it should be"
