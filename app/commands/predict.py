@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -131,7 +132,10 @@ def find_photos(given: Sequence[Path]) -> list[Path]:
 
 
 def picture_targets(paths: Sequence[Path], image: Path | None, kind: str) -> list[Path | None]:
-    """Where the picture of each photo goes; nowhere without ``image``. Names are distinct."""
+    """Where the picture of each photo goes; nowhere without ``image``. Names are distinct.
+
+    Refused is what would be written over one of the photos.
+    """
     if image is None:
         return [None] * len(paths)
     if len(paths) == 1 and not image.is_dir() and image.suffix:
@@ -139,17 +143,24 @@ def picture_targets(paths: Sequence[Path], image: Path | None, kind: str) -> lis
             raise typer.BadParameter(
                 f"ends in none of {', '.join(PICTURE_TYPES)}", param_hint="--image"
             )
-        return [image]
-    if image.exists() and not image.is_dir():
+        targets = [image]
+    elif image.exists() and not image.is_dir():
         raise typer.BadParameter("several photos need a folder", param_hint="--image")
-    taken: dict[str, int] = {}
-    targets: list[Path | None] = []
-    for path in paths:
-        taken[path.stem] = taken.get(path.stem, 0) + 1
-        again = taken[path.stem]
-        name = path.stem if again == 1 else f"{path.stem}-{again}"
-        targets.append(image / f"{name}.{kind}")
-    return targets
+    else:
+        targets = [image / f"{name}.{kind}" for name in _distinct([path.stem for path in paths])]
+    photos = {path.resolve() for path in paths}
+    if lost := [target for target in targets if target.resolve() in photos]:
+        raise typer.BadParameter(f"{lost[0]} is a photo and would be lost", param_hint="--image")
+    return list(targets)
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """Each name once; what comes again gets a number."""
+    found: dict[str, None] = {}
+    for name in names:
+        numbered = (f"{name}-{again}" for again in itertools.count(2))
+        found[name if name not in found else next(it for it in numbered if it not in found)] = None
+    return list(found)
 
 
 def estimate_all(

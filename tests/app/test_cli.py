@@ -13,6 +13,7 @@ import numpy as np
 from typer.testing import CliRunner, Result
 
 from app.cli import cli
+from app.commands.predict import picture_targets
 from app.schemas import BatchItem, PosesAnswer
 from app.version import VERSION
 from tests.app.conftest import RENDERS
@@ -97,11 +98,20 @@ def test_predict_says_what_is_wrong_with_the_command(tmp_path: Path) -> None:
         ((tmp_path / "none.jpg",), "does not exist"),
         ((photo, "--image", tmp_path / "out.gif"), ".svg"),
         ((photo, RENDERS / "006.jpg", "--image", photo), "folder"),
+        ((photo, "--image", photo), "would be lost"),
+        ((RENDERS, "--image", RENDERS, "--image-type", "jpg"), "would be lost"),
         ((photo, "--method", "magic"), "fusion"),
     ):
         done = invoke("predict", *arguments)
         assert done.exit_code == 2, arguments
         assert said in done.stderr
+
+
+def test_pictures_have_names_of_their_own(tmp_path: Path) -> None:
+    photos = [tmp_path / name for name in ("a-2.jpg", "a.jpg", "a.png", "b/a.jpg", "b/c.jpg")]
+    targets = picture_targets(photos, tmp_path / "out", "svg")
+    names = ["a-2.svg", "a.svg", "a-3.svg", "a-4.svg", "c.svg"]
+    assert targets == [tmp_path / "out" / name for name in names]
 
 
 def test_predict_refuses_what_is_no_photo(library_dir: Path, tmp_path: Path) -> None:
