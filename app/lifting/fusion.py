@@ -56,12 +56,12 @@ class FusionSettings:
     Chosen on mocap subjects of whom no table is measured (and who were not in that trial's
     library), except those that came later: ``bandwidth_px``, ``localisation_bones``,
     ``proportion_spread``, ``asymmetry`` and ``outlier_prior`` on some of the even-numbered people
-    of the tables' sets, ``ambiguous_mm`` on every fifth of the first; and ``doubt``, on frames of
-    the network's own subjects given other proportions.
+    of the tables' sets, ``ambiguous_mm`` on every fifth of the first; and the doubts, which frames
+    of the network's own subjects hardly tell apart, on every tenth of both.
 
     ``bandwidth_px``, ``adaptive``, ``granularity_px``, ``localisation_bones``: see
     ``ensemble.local_prior``; ``proportion_spread``: see ``ensemble.place_ensemble``;
-    ``doubt``: see ``learned.with_learned``;
+    ``doubt_of_noisy``, ``doubt_of_exact``, ``doubt_px``: see :meth:`doubt`;
     ``asymmetry``: standard deviation of the log ratio of two sides' lengths; ``noise_px``: the
     noise levels ν that are weighed by evidence; ``outlier_prior``: probability that a joint of
     full confidence is elsewhere. Depth is ambiguous if a limb's far end is within
@@ -74,12 +74,24 @@ class FusionSettings:
     granularity_px: float = 2.0
     localisation_bones: float = 20.0
     proportion_spread: float = 0.1
-    doubt: float = 2.0
+    doubt_of_noisy: float = 0.6
+    doubt_of_exact: float = 6.0
+    doubt_px: float = 2.0
     asymmetry: float = 0.15
     noise_px: tuple[float, ...] = (1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0)
     outlier_prior: float = 0.06
     ambiguous_mm: float = 85.0
     ambiguous_sigmas: float = 0.5
+
+    def doubt(self, noise_var: float) -> float:
+        """What the covariance of the network's errors is multiplied by at a noise of ν² px².
+
+        Exact 2D the neighbours explain best, whatever the proportions; by noise they lose more than
+        the network, which has learned from noisy joints. So from ``doubt_of_exact`` above it, doubt
+        falls to ``doubt_of_noisy``, half of the way at ``doubt_px``.
+        """
+        share = 1.0 / (1.0 + noise_var**2 / self.doubt_px**4)
+        return self.doubt_of_noisy + self.doubt_of_exact * share
 
 
 @dataclass(frozen=True)
@@ -145,13 +157,14 @@ def fuse(
         prior.root_depth_mm,
     )
     if learned is not None:
-        posterior = with_learned(posterior, learned, ensemble.px_per_unit, settings.doubt)
+        doubt = settings.doubt(evidence.mean_noise_var)
+        posterior = with_learned(posterior, learned, ensemble.px_per_unit, doubt)
     posterior = _made_symmetric(posterior, ensemble.px_per_unit, settings.asymmetry)
     posterior = _made_as_tall(posterior, ensemble.px_per_unit, ensemble.stature_mm)
     suspect = evidence.suspect(confidence[seen], settings.outlier_prior)
     outlier = None if suspect is None else int(seen[suspect])
-    if outlier is None and learned is not None:
-        outlier = misplaced(learned, points, confidence, ensemble.px_per_unit)
+    if learned is not None:
+        outlier = misplaced(learned, points, confidence, ensemble.px_per_unit, outlier)
     return FusedPose(
         joints_mm=_joints(posterior, ensemble.px_per_unit),
         spread_mm=_spread_about_root(posterior),

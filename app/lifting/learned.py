@@ -7,8 +7,9 @@ with the covariance of its errors, so the update is that of any observation:
     x̂ = x + P (P + κ R)⁻¹ (y - x)
 
 with P the fused posterior and R the network's covariance. Both have looked at the same 2D joints,
-so their errors are not independent: that is what κ > 1 (``doubt``) allows for. How large the
-person is stays what the neighbours say; the network does not know.
+so their errors are not independent, and neither's are quite as large as it says: κ (``doubt``)
+weighs one against the other. How large the person is stays what the neighbours say; the network
+does not know.
 """
 
 from __future__ import annotations
@@ -22,29 +23,39 @@ from models.pose_lifter import LearnedPose
 
 _SETTLED_PX = 0.1
 """Spread added to each coordinate: a depth relative to the root's has none along the root's."""
-_ASTRAY, _CLOSE_PX = 5.0, 2.0
-"""How many times farther than is usual for this person's joints a misplaced one lies, and what is
-added to the usual distance, standard pixels. Finds half of the limb joints moved by half a torso,
-and wrongly a joint of one person in two hundred (in thirty at 10 px of noise)."""
+_ASTRAY, _FAR_ASTRAY, _CLOSE_PX = 5.0, 8.0, 2.0
+"""How many times farther than is usual for this person's joints a misplaced one lies, if the
+neighbours suspect it too and if they do not; and what is added to the usual distance, standard
+pixels."""
 
 
 def misplaced(
-    learned: LearnedPose, points: Floats, confidence: Floats, px_per_unit: float
+    learned: LearnedPose,
+    points: Floats,
+    confidence: Floats,
+    px_per_unit: float,
+    suspect: int | None = None,
 ) -> int | None:
     """The joint that the network puts far from where it was seen, if there is one.
+
+    That the neighbours suspect a joint is not enough: people in rare postures contradict them as
+    well, and without that joint they are told still worse.
 
     Args:
         learned: the network's answer in the same view.
         points: (J, 2) observed, normalised image coordinates.
         confidence: (J,) 0 = missing.
         px_per_unit: standard pixels in a normalised unit.
+        suspect: the joint that contradicts the neighbours, if any.
 
     """
     seen = np.flatnonzero(confidence > 0)
     apart = px_per_unit * np.sqrt(((learned.points - points)[seen] ** 2).sum(1))
     worst = int(np.argmax(apart))
     usual = float(np.sort(apart)[len(apart) // 2]) + _CLOSE_PX
-    return int(seen[worst]) if apart[worst] > _ASTRAY * usual else None
+    found = int(seen[worst])
+    far = _ASTRAY if found == suspect else _FAR_ASTRAY
+    return found if apart[worst] > far * usual else None
 
 
 def with_learned(

@@ -1,9 +1,12 @@
 """The learned lifter as an observation: between no trust and all of it, and what it is worth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from app.lifting.ensemble import LocalPrior
+from app.lifting.fusion import FusionSettings
 from app.lifting.learned import misplaced, with_learned
 from app.lifting.lifter import Lifter, LiftingSettings
 from evaluation.metrics import rigid_error_mm
@@ -54,9 +57,7 @@ def test_it_helps(lifter: Lifter, both: Lifter, people: People) -> None:
 
 def test_without_trust_it_changes_nothing(library: Library, people: People) -> None:
     settings = LiftingSettings()
-    doubtful = LiftingSettings(
-        fusion=type(settings.fusion)(**{**vars(settings.fusion), "doubt": 1e14})
-    )
+    doubtful = LiftingSettings(fusion=replace(settings.fusion, doubt_of_noisy=1e14))
     alone = lift_one(Lifter(library), people.observation(0))
     beside = lift_one(Lifter(library, doubtful, PoseLifter()), people.observation(0))
     np.testing.assert_allclose(beside.joints_3d_mm, alone.joints_3d_mm, atol=1e-3)
@@ -87,16 +88,39 @@ def test_a_joint_that_lies_far_from_where_the_network_puts_it_is_found(people: P
         points = (people.joints_px[index] - people.joints_px[index].mean(0)) / 1150.0
         joint = (4, 7, 10, 13)[index % 4]
         clean = network.lift(points, np.ones(14))
-        wrongly += misplaced(clean, points, np.ones(14), PX_PER_UNIT) is not None
+        wrongly += misplaced(clean, points, np.ones(14), PX_PER_UNIT, joint) is not None
         moved = points.copy()
         # Outwards: what makes a limb shorter may as well be a bent one.
         outwards = points[joint] - points[joint - 2]
         moved[joint] += np.linalg.norm(points[1] - points[8]) * outwards / np.linalg.norm(outwards)
         said = network.lift(moved, np.ones(14))
-        found += misplaced(said, moved, np.ones(14), PX_PER_UNIT) == joint
+        found += misplaced(said, moved, np.ones(14), PX_PER_UNIT, joint) == joint
         confidence = np.ones(14)
         confidence[joint] = 0.0
         without = network.lift(moved, confidence)
-        assert misplaced(without, moved, confidence, PX_PER_UNIT) != joint
+        assert misplaced(without, moved, confidence, PX_PER_UNIT, joint) != joint
     assert found >= 10
     assert wrongly <= 3
+
+
+def test_the_noisier_the_joints_the_more_is_left_to_the_network() -> None:
+    settings = FusionSettings()
+    doubts = [settings.doubt(noise_px**2) for noise_px in (0.0, 2.0, 4.0, 10.0)]
+    assert doubts == sorted(doubts, reverse=True)
+    assert doubts[0] == pytest.approx(settings.doubt_of_noisy + settings.doubt_of_exact)
+    assert doubts[1] == pytest.approx(settings.doubt_of_noisy + 0.5 * settings.doubt_of_exact)
+
+
+def test_suspected_joints_are_more_readily_set_aside() -> None:
+    points = np.random.default_rng(0).normal(size=(14, 2)) * 0.05
+    for apart_px, suspect, found in (
+        (6.5 * 4.0, 3, 3),
+        (6.5 * 4.0, None, None),
+        (6.5 * 4.0, 9, None),
+        (9.0 * 4.0, None, 3),
+        (4.5 * 4.0, 3, None),
+    ):
+        said = points + np.array([2.0, 0.0]) / PX_PER_UNIT
+        said[3] = points[3] + np.array([0.0, apart_px]) / PX_PER_UNIT
+        learned = LearnedPose(said, np.zeros(14), np.eye(42))
+        assert misplaced(learned, points, np.ones(14), PX_PER_UNIT, suspect) == found

@@ -63,34 +63,6 @@ def test_robust_weights_resist_a_wrong_joint(poses: Floats) -> None:
     assert errors[1] < 0.2 * errors[0]
 
 
-def test_a_step_follows_the_derivatives_taken_by_finite_differences(poses: Floats) -> None:
-    """One damped Gauss-Newton step, by a Jacobian that only projects."""
-    rotations, translations = random_cameras(len(poses))
-    targets = see(poses, rotations, translations) + RNG.normal(size=(len(poses), 14, 2)) * 0.005
-    weights = RNG.uniform(0.2, 1.0, (len(poses), 14))
-    start = nudge(rotations)
-    before = resect(poses, start, targets, weights, iterations=0)
-    after = resect(poses, start, targets, weights, iterations=1)
-    columns = []
-    for direction in np.eye(6) * ([1e-5] * 3 + [1e-2] * 3):
-        turn = rotation_exponential(direction[None, :3])
-        ahead = see(poses, turn @ start, before.translation_mm + direction[3:])
-        back = see(poses, np.swapaxes(turn, 1, 2) @ start, before.translation_mm - direction[3:])
-        columns.append((ahead - back) / (2.0 * np.linalg.norm(direction)))
-    jacobian = np.stack(columns, -1).reshape(len(poses), 28, 6)
-    weighted = np.repeat(weights, 2, axis=1)[..., None] * jacobian
-    normal = np.swapaxes(jacobian, 1, 2) @ weighted
-    normal += 1e-4 * np.eye(6) * normal
-    pull = np.swapaxes(weighted, 1, 2) @ before.residuals.reshape(len(poses), 28, 1)
-    step = -np.linalg.solve(normal, pull)[..., 0]
-    taken = (after.translation_mm != before.translation_mm).any(1)
-    assert taken.mean() > 0.9
-    expected = rotation_exponential(step[taken, :3]) @ start[taken]
-    np.testing.assert_allclose(after.rotation[taken], expected, atol=1e-6)
-    moved = (after.translation_mm - before.translation_mm)[taken]
-    np.testing.assert_allclose(moved, step[taken, 3:], rtol=1e-4, atol=0.01)
-
-
 def test_agrees_with_opencv_on_noisy_cases(poses: Floats) -> None:
     rotations, translations = random_cameras(len(poses))
     targets = see(poses, rotations, translations) + RNG.normal(size=(len(poses), 14, 2)) * 0.005
@@ -183,3 +155,31 @@ def test_stays_in_front_of_the_camera_when_the_joints_are_nonsense(poses: Floats
     found = resect(poses, rotations, targets, np.ones(14))
     assert (found.points_mm[..., 2] > 0).all()
     assert np.isfinite(found.residuals).all()
+
+
+def test_a_step_follows_the_derivatives_taken_by_finite_differences(poses: Floats) -> None:
+    """One damped Gauss-Newton step, by a Jacobian that only projects."""
+    rotations, translations = random_cameras(len(poses))
+    targets = see(poses, rotations, translations) + RNG.normal(size=(len(poses), 14, 2)) * 0.005
+    weights = RNG.uniform(0.2, 1.0, (len(poses), 14))
+    start = nudge(rotations)
+    before = resect(poses, start, targets, weights, iterations=0)
+    after = resect(poses, start, targets, weights, iterations=1)
+    columns = []
+    for direction in np.eye(6) * ([1e-5] * 3 + [1e-2] * 3):
+        turn = rotation_exponential(direction[None, :3])
+        ahead = see(poses, turn @ start, before.translation_mm + direction[3:])
+        back = see(poses, np.swapaxes(turn, 1, 2) @ start, before.translation_mm - direction[3:])
+        columns.append((ahead - back) / (2.0 * np.linalg.norm(direction)))
+    jacobian = np.stack(columns, -1).reshape(len(poses), 28, 6)
+    weighted = np.repeat(weights, 2, axis=1)[..., None] * jacobian
+    normal = np.swapaxes(jacobian, 1, 2) @ weighted
+    normal += 1e-4 * np.eye(6) * normal
+    pull = np.swapaxes(weighted, 1, 2) @ before.residuals.reshape(len(poses), 28, 1)
+    step = -np.linalg.solve(normal, pull)[..., 0]
+    taken = (after.translation_mm != before.translation_mm).any(1)
+    assert taken.mean() > 0.9
+    expected = rotation_exponential(step[taken, :3]) @ start[taken]
+    np.testing.assert_allclose(after.rotation[taken], expected, atol=1e-6)
+    moved = (after.translation_mm - before.translation_mm)[taken]
+    np.testing.assert_allclose(moved, step[taken, 3:], rtol=1e-4, atol=0.01)
