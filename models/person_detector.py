@@ -58,16 +58,16 @@ def decode(
     A person is a local maximum of the centre map; of boxes that overlap by more than MAX_OVERLAP
     the best stays.
     """
-    score = 1 / (1 + np.exp(-np.clip(maps[0].astype(np.float64), -30, 30)))
-    h, w = score.shape
-    padded = np.pad(score, 1)
-    around = np.max([padded[i : i + h, j : j + w] for i in range(3) for j in range(3)], axis=0)
-    y, x = np.nonzero((score >= around) & (score > threshold))
+    centre = np.ascontiguousarray(maps[0], np.float32)
+    y, x = np.nonzero(centre >= cv2.dilate(centre, np.ones((3, 3), np.uint8)))
+    score = 1 / (1 + np.exp(-np.clip(centre[y, x].astype(np.float64), -30, 30)))
+    likely = score > threshold
+    y, x, score = y[likely], x[likely], score[likely]
     sides = np.exp(np.clip(maps[1:, y, x].astype(np.float64), -4, 4)) * unit_px
     cx, cy = (x + 0.5) * stride - 0.5, (y + 0.5) * stride - 0.5
     boxes = np.stack([cx - sides[0], cy - sides[1], cx + sides[2], cy + sides[3]], 1)
-    order = np.argsort(-score[y, x], kind="stable")
-    boxes, scores = boxes[order], score[y, x][order]
+    order = np.argsort(-score, kind="stable")
+    boxes, scores = boxes[order], score[order]
     kept: list[int] = []
     for i in range(len(boxes)):
         if not kept or iou(boxes[i : i + 1], boxes[kept]).max() < MAX_OVERLAP:
@@ -82,6 +82,10 @@ def shrunk(
     height, width = image.shape[:2]
     scale = long_side_px / max(height, width)
     small_w, small_h = max(1, round(width * scale)), max(1, round(height * scale))
+    # Halving is ten times as fast as other averages over areas, and then they have less to do.
+    while min(height / small_h, width / small_w) >= 2 and not (height % 2 or width % 2):
+        height, width = height // 2, width // 2
+        image = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     rows, columns = (-(-side // GRID_PX) * GRID_PX for side in (small_h, small_w))
     canvas = np.zeros((rows, columns, 3), np.uint8)
