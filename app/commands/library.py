@@ -24,7 +24,7 @@ from library_store.build import (
     describe_library,
     verify_library,
 )
-from library_store.importers import Clip, read_each, states_licence, write_npz
+from library_store.importers import Clip, find_files, read_each, states_licence, write_npz
 from library_store.library import load
 from library_store.manifest import Manifest
 from library_store.merge import merge_libraries
@@ -332,6 +332,10 @@ def import_mocap(
     """Read motion capture files as 14-joint poses in mm, Y up, and say what was noticed."""
     if out.suffix.lower() != ".npz":
         raise typer.BadParameter("must end in .npz", param_hint="--out")
+    if out.resolve() in {path.resolve() for path in find_files(paths)}:
+        raise typer.BadParameter(
+            f"{out} is among what is read: write it elsewhere", param_hint="--out"
+        )
     kept: list[Clip] = []
     n_skipped = 0
     for it in read_each(paths, mapping=mapping, strict=strict):

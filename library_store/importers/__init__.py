@@ -3,6 +3,15 @@
 from library_store.importers.clip import Clip, MocapError
 from library_store.importers.npz import states_licence
 from library_store.importers.npz import write as write_npz
-from library_store.importers.reader import read, read_all, read_each
+from library_store.importers.reader import find_files, read, read_all, read_each
 
-__all__ = ["Clip", "MocapError", "read", "read_all", "read_each", "states_licence", "write_npz"]
+__all__ = [
+    "Clip",
+    "MocapError",
+    "find_files",
+    "read",
+    "read_all",
+    "read_each",
+    "states_licence",
+    "write_npz",
+]

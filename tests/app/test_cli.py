@@ -182,6 +182,8 @@ def test_library_import(tmp_path: Path) -> None:
         assert written["frame"].tolist() == [1, 5, 9]
         assert written["clip_subject"].tolist() == ["cmu_02"]
         assert "CMU" in str(written["license"])
+    again = invoke("library", "import", tmp_path, "--out", out)
+    assert (again.exit_code, "is among what is read" in again.stderr) == (2, True)
     out.unlink()
     done = run("library", "import", tmp_path, "--out", out, "--strict")
     assert done.returncode == 1
