@@ -98,6 +98,23 @@ def test_a_joint_that_contradicts_the_others_is_named() -> None:
     assert falsely <= 1
 
 
+def test_an_unsure_joint_is_followed_less() -> None:
+    """As its covariance grows, and as its confidence falls."""
+    ensemble, points, _ = linear_world()
+    moved = points.copy()
+    moved[10] += 20.0 / PX
+
+    def followed(variance_px2: float, confidence: float) -> float:
+        sure, covariance = ALL.copy(), np.tile(4.0 * np.eye(2), (14, 1, 1))
+        sure[10], covariance[10] = confidence, variance_px2 * np.eye(2)
+        found = normalised_projection(fuse(ensemble, moved, sure, covariance, LOOSE).joints_mm)
+        return float(np.linalg.norm(found[10] - points[10]) * PX)
+
+    assert followed(4.0, 1.0) > 1.2 * followed(400.0, 1.0)
+    assert followed(4.0, 1.0) > 1.2 * followed(4.0, 0.01)
+    assert followed(400.0, 0.5) == pytest.approx(followed(800.0, 1.0))
+
+
 def test_localisation_is_positive_definite_and_fades_with_bones() -> None:
     factors = localisation(3.0)
     assert np.linalg.eigvalsh(factors).min() > 0
