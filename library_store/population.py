@@ -6,6 +6,10 @@ common mean (men 1,756 ± 69 mm, women 1,629 ± 64 mm: Gordon et al., 2012 Anthr
 U.S. Army Personnel, Natick/TR-15/007). Some people are children, from 0.6 of an adult's stature (at
 about four years) upwards: head and neck then have 0.77 of an adult's length, the legs 0.56 and the
 trunk 0.63 (powers of the stature, set by us; Snyder et al., UM-HSRI-77-17, have such proportions).
+
+The people of a library are *evened*: each as tall as the subject, all of the subjects' mean
+proportions. Matching then compares postures alone; what another build does to a picture, lifting
+knows by itself.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ from library_store.proportions import draw_factors
 
 _GROWTH = {"head": 0.5, "trunk": 0.9, "thigh": 1.15, "shank": 1.15}
 """Lengths grow with stature to this power; all others in proportion."""
+_TALL = [LENGTHS.index(name) for name in ("head", "trunk", "thigh", "shank")]
 
 
 @dataclass(frozen=True)
@@ -40,3 +45,11 @@ class Population:
         powers = np.array([_GROWTH.get(name, 1.0) for name in LENGTHS])
         drawn: Float = lengths_mm * factors * stature[:, None] ** powers
         return drawn
+
+
+def even_proportions(lengths_mm: Float) -> Float:
+    """Lengths (n, 8) of people as tall as these (n, 8), all of their mean proportions."""
+    mean = np.exp(np.log(lengths_mm).mean(axis=0))
+    tall = lengths_mm[:, _TALL].sum(axis=1, keepdims=True) / mean[_TALL].sum()
+    evened: Float = tall * mean
+    return evened

@@ -19,7 +19,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 from zipfile import BadZipFile
@@ -39,7 +39,7 @@ from library_store.anatomy import (
 from library_store.compose import reaching_arms, sitting_legs
 from library_store.errors import LibraryError
 from library_store.limits import Limits
-from library_store.population import Population
+from library_store.population import Population, even_proportions
 
 DEFAULT_PRIOR = Path(__file__).parent / "prior_data" / "cmu.npz"
 """The prior that the default library is sampled from."""
@@ -167,20 +167,21 @@ class PosePrior:
                 f"read: {error}; restore both files from the repository or the package"
             ) from error
 
-    def sample(self, n: int, rng: np.random.Generator) -> Float:
+    def sample(self, n: int, rng: np.random.Generator, *, evened: bool = False) -> Float:
         """Draw ``n`` poses: (n, 14, 3) float64 mm, root-centred, Y up, heading along +Z.
 
+        ``evened``: all grown people have the same proportions (:mod:`library_store.population`).
         The same generator state gives the same poses. Raises ``RuntimeError`` if the limits refuse
         nearly everything, which only a broken prior does.
         """
-        return self.draw(n, rng).poses
+        return self.draw(n, rng, evened=evened).poses
 
-    def draw(self, n: int, rng: np.random.Generator) -> Drawn:
+    def draw(self, n: int, rng: np.random.Generator, *, evened: bool = False) -> Drawn:
         """:meth:`sample`, and what was done to each person."""
         accepted: list[Drawn] = []
         missing = n
         for _ in range(_ROUNDS):
-            tried = self._draw(missing + missing // 4 + 8, rng)
+            tried = self._draw(missing + missing // 4 + 8, rng, evened=evened)
             rows = np.flatnonzero(self.limits.allow(tried.poses))[:missing]
             accepted.append(Drawn(tried.poses[rows], tried.kinds[rows]))
             missing -= len(rows)
@@ -195,7 +196,7 @@ class PosePrior:
         """The share of ``n`` drawn poses that keep the limits."""
         return float(self.limits.allow(self._draw(n, rng).poses).mean())
 
-    def _draw(self, n: int, rng: np.random.Generator) -> Drawn:
+    def _draw(self, n: int, rng: np.random.Generator, *, evened: bool = False) -> Drawn:
         """``n`` poses that are not yet held against the limits."""
         shares, kinds = self.composition, np.zeros(n, dtype=np.int64)
         cuts = np.cumsum([shares.each_arm, shares.other_arms, shares.other_upper])
@@ -216,7 +217,10 @@ class PosePrior:
         legs += shares.jitter * rng.standard_normal(legs.shape)
         upper += shares.jitter * _UPPER_JITTER * rng.standard_normal(upper.shape)
         subjects = self.exemplars.subjects[whose[0]]
-        lengths = self.population.draw(self.exemplars.lengths_mm[subjects], rng)
+        usual, population = self.exemplars.lengths_mm, self.population
+        if evened:
+            usual, population = even_proportions(usual), replace(population, bone_sd=0.0)
+        lengths = population.draw(usual[subjects], rng)
 
         rows = _some(n, shares.tilted, rng)
         legs[rows, _UP] = _tilt(unit(legs[rows, _UP]), shares.tilt_deg, rng)

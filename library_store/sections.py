@@ -73,7 +73,7 @@ def camera_generator(seed: int, chunk: int) -> np.random.Generator:
 
 @dataclass(frozen=True)
 class Sampled:
-    """Poses drawn from a prior."""
+    """Poses drawn from a prior, of people of even proportions."""
 
     prior: PosePrior
     cameras: NDArray[np.int64]
@@ -93,7 +93,8 @@ class Sampled:
     def chunks(self) -> Iterator[Chunk]:
         """Samples; always whole chunks are drawn, so that a sample does not depend on the rest."""
         for number, rows in enumerate(slices(len(self.cameras))):
-            drawn = self.prior.sample(CHUNK, generator(self.seed, number, _SAMPLED))
+            rng = generator(self.seed, number, _SAMPLED)
+            drawn = self.prior.sample(CHUNK, rng, evened=True)
             yield Chunk(drawn[: rows.stop - rows.start], _numbers(rows), no_parts())
 
 

@@ -5,7 +5,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from library_store.anatomy import LENGTHS, BodyParts, decode
 from library_store.compose import reaching_arms, sitting_legs, two_bones
-from library_store.population import Population
+from library_store.population import Population, even_proportions
 from library_store.prior import PosePrior
 from library_store.skeleton import HEAD_TOP, L_WRIST, NECK, R_WRIST
 
@@ -74,3 +74,12 @@ def test_children_have_large_heads_and_short_legs() -> None:
     assert np.median(small[:, head] / small[:, trunk]) > 1.05 * 252.0 / 541.0
     assert np.median(small[:, thigh] / small[:, trunk]) < 0.97 * 401.0 / 541.0
     assert 0.5 < np.median(small[:, trunk]) / 541.0 < 0.95
+
+
+def test_even_proportions_keep_everybodys_height() -> None:
+    people = np.random.default_rng(6).uniform(150.0, 500.0, (9, len(LENGTHS)))
+    evened = even_proportions(people)
+    tall = [LENGTHS.index(name) for name in ("trunk", "head", "thigh", "shank")]
+    assert_allclose(evened[:, tall].sum(axis=1), people[:, tall].sum(axis=1))
+    assert_allclose(evened / evened[:, :1], np.tile(evened[0] / evened[0, 0], (9, 1)))
+    assert_allclose(even_proportions(people[:1]), people[:1])

@@ -62,6 +62,25 @@ def test_people_have_human_proportions(poses: np.ndarray) -> None:
     assert 0.85 < np.median(lengths["thigh"] / lengths["shank"]) < 1.05
 
 
+def test_evened_people_have_the_same_proportions_at_their_own_size(prior: PosePrior) -> None:
+    own, evened = (
+        dict(zip(LENGTHS, measure_lengths(drawn).T, strict=True))
+        for drawn in (
+            prior.sample(3000, np.random.default_rng(4)),
+            prior.sample(3000, np.random.default_rng(4), evened=True),
+        )
+    )
+    for name in ("hips", "head", "upper_arm", "forearm", "shank"):
+        ratio = evened[name] / evened["thigh"]
+        same = np.abs(ratio / np.median(ratio) - 1.0) < 1e-6
+        # All but the children.
+        assert same.mean() > 0.95, name
+        assert np.std(np.log(own[name] / own["thigh"])) > 0.02, name
+    sizes = [np.log(lengths["thigh"] + lengths["shank"]) for lengths in (own, evened)]
+    assert_allclose(np.median(sizes[0]), np.median(sizes[1]), atol=0.03)
+    assert 0.6 * sizes[0].std() < sizes[1].std() < 1.1 * sizes[0].std()
+
+
 def test_left_and_right_are_alike(poses: np.ndarray) -> None:
     mirrored = poses[:, LSP14.mirror] * (-1.0, 1.0, 1.0)
     spread = poses.std(axis=0)
