@@ -1,7 +1,7 @@
 """Load over kept-alive connections: closed loop (each client waits) and open loop (a fixed rate).
 
-The generator shares the machine's cores with the server: whoever uses it says how much of them
-it took (``Load.client_cpu_s``).
+The generator shares the machine's cores with the server, so it does little itself (uvloop, a bare
+protocol); whoever uses it says how much of them it took (``Load.client_cpu_s``).
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ import time
 from collections import Counter
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
+
+import uvloop
 
 from benchmarks.service import Service
 
@@ -21,7 +23,55 @@ _LENGTH = re.compile(rb"content-length: (\d+)", re.IGNORECASE)
 _POLITE_PAUSE_S = 0.02
 """What a client of the closed loop waits after a refusal."""
 
-Connection = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+
+class Connection(asyncio.Protocol):
+    """A kept-alive connection that answers one request after the other."""
+
+    def __init__(self) -> None:
+        self._received = bytearray()
+        self._answer: asyncio.Future[bytes] | None = None
+
+    @classmethod
+    async def open(cls, service: Service) -> Self:
+        """A new connection to the service."""
+        _, connection = await asyncio.get_running_loop().create_connection(cls, *service.address)
+        return connection
+
+    def ask(self, request: bytes) -> asyncio.Future[bytes]:
+        """The head of the answer once its body is read, too; ``ConnectionError`` if it breaks."""
+        self._answer = asyncio.get_running_loop().create_future()
+        if self._transport.is_closing():
+            self._answer.set_exception(ConnectionError("the connection is closed"))
+        else:
+            self._transport.write(request)
+        return self._answer
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._transport.close()
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Keep the transport."""
+        self._transport = transport
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Who waits for an answer will get none."""
+        if self._answer is not None and not self._answer.done():
+            self._answer.set_exception(exc or ConnectionError("closed before the answer's end"))
+
+    def data_received(self, data: bytes) -> None:
+        """Gather the answer."""
+        self._received += data
+        end = self._received.find(b"\r\n\r\n") + 4
+        if end < 4:
+            return
+        head = bytes(self._received[:end])
+        length = _LENGTH.search(head)
+        whole = end + (int(length[1]) if length else 0)
+        if len(self._received) >= whole and self._answer is not None:
+            del self._received[:whole]
+            if not self._answer.done():
+                self._answer.set_result(head)
 
 
 @dataclass
@@ -70,14 +120,14 @@ def closed_loop(service: Service, request: bytes, concurrency: int, seconds: flo
     """``concurrency`` clients, each sending its next request when the last is answered."""
 
     async def client(load: Load, end: float) -> None:
-        connection = await open_connection(service)
+        connection = await Connection.open(service)
         while time.perf_counter() < end:
             started = time.perf_counter()
-            head = await exchange(connection, request)
+            head = await connection.ask(request)
             load.record(head, 1e3 * (time.perf_counter() - started))
             if head[9:12] != b"200":
                 await asyncio.sleep(_POLITE_PAUSE_S)
-        connection[1].close()
+        connection.close()
 
     async def run(load: Load) -> None:
         end = time.perf_counter() + seconds
@@ -92,9 +142,9 @@ def open_loop(service: Service, request: bytes, rate: float, seconds: float) -> 
     async def one(load: Load, idle: list[Connection]) -> None:
         started = time.perf_counter()
         try:
-            connection = idle.pop() if idle else await open_connection(service)
-            head = await exchange(connection, request)
-        except (OSError, asyncio.IncompleteReadError):
+            connection = idle.pop() if idle else await Connection.open(service)
+            head = await connection.ask(request)
+        except OSError:
             load.broken += 1
             return
         load.record(head, 1e3 * (time.perf_counter() - started))
@@ -107,8 +157,8 @@ def open_loop(service: Service, request: bytes, rate: float, seconds: float) -> 
             for number in range(int(rate * seconds)):
                 await asyncio.sleep(max(0.0, begin + number / rate - time.perf_counter()))
                 tasks.create_task(one(load, idle))
-        for _, writer in idle:
-            writer.close()
+        for connection in idle:
+            connection.close()
 
     return _measured(service, run)
 
@@ -116,25 +166,8 @@ def open_loop(service: Service, request: bytes, rate: float, seconds: float) -> 
 def _measured(service: Service, run: Callable[[Load], Coroutine[Any, Any, None]]) -> Load:
     load = Load()
     started, client, server = time.perf_counter(), time.process_time(), service.cpu_s()
-    asyncio.run(run(load))
+    uvloop.run(run(load))
     load.seconds = time.perf_counter() - started
     load.client_cpu_s = time.process_time() - client
     load.server_cpu_s = service.cpu_s() - server
     return load
-
-
-async def open_connection(service: Service) -> Connection:
-    """A new connection to the service."""
-    host, port = service.address
-    return await asyncio.open_connection(host, port, limit=1 << 20)
-
-
-async def exchange(connection: Connection, request: bytes) -> bytes:
-    """The head of the answer, its body read and dropped."""
-    reader, writer = connection
-    writer.write(request)
-    await writer.drain()
-    head = await reader.readuntil(b"\r\n\r\n")
-    length = _LENGTH.search(head)
-    await reader.readexactly(int(length[1]) if length else 0)
-    return head

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from benchmarks.load import Load, encode_request, exchange, open_connection
+from benchmarks.load import Connection, Load, encode_request
 from benchmarks.service import DEFAULT_PHOTO, Service, given_or_started
 
 EXPECTED = {200, 413, 415, 422, 503}
@@ -86,14 +86,14 @@ async def soak(
     rng = np.random.default_rng(0)
 
     async def client() -> None:
-        connection = await open_connection(service)
+        connection = await Connection.open(service)
         while time.perf_counter() < end:
             started = time.perf_counter()
-            head = await exchange(connection, requests[int(rng.integers(len(requests)))])
+            head = await connection.ask(requests[int(rng.integers(len(requests)))])
             load.record(head, 1e3 * (time.perf_counter() - started))
             if head[9:12] == b"503":
                 await asyncio.sleep(0.05)
-        connection[1].close()
+        connection.close()
 
     history: list[Minute] = []
 
