@@ -6,6 +6,7 @@ import difflib
 import os
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
+from urllib.parse import urlsplit
 
 from pydantic import Field, SecretStr, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
@@ -197,6 +198,15 @@ class Settings(BaseSettings):
             if origin != "*" and (scheme not in {"http", "https"} or not rest or "/" in rest):
                 raise ValueError(f"{origin!r} is not an origin like https://example.org")
         return origins
+
+    @field_validator("milvus_uri")
+    @classmethod
+    def _is_an_address(cls, uri: str | None) -> str | None:
+        if uri is not None:
+            parts = urlsplit(uri)  # its port raises ValueError when it is none
+            if parts.scheme not in {"http", "https"} or not parts.hostname or parts.port == 0:
+                raise ValueError(f"{uri!r} is not an address like http://host:19530")
+        return uri
 
     @model_validator(mode="after")
     def _fit_together(self) -> Self:

@@ -67,8 +67,10 @@ def push_library(
     check_files(directory, manifest, sums=True)
     table = open_table(directory / "descriptors.npy").astype(np.float32, copy=False)
     collection = collection_name(manifest)
+    report("waiting for Milvus", 0.0)
     try:
         with closing(patiently(connect, settings)) as client:
+            report("waiting for Milvus", 1.0)
             resumed = prepare(client, collection)
             n_before = write(
                 client, collection, table, resumed, lambda done: report("descriptors", done)

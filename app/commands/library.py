@@ -205,9 +205,7 @@ def push(
 
     Killed, it goes on where it was when it is started again; what is there is not sent twice.
     """
-    settings = load_settings()
-    if uri:
-        settings = settings.model_copy(update={"milvus_uri": uri})
+    settings = load_settings(**({"milvus_uri": uri} if uri else {}))
     milvus = milvus_of(settings)
     if milvus is None:
         raise typer.BadParameter("or POSEMATCH_MILVUS_URI must be given", param_hint="--uri")

@@ -60,6 +60,10 @@ def test_unknown_settings_are_refused_with_a_hint(monkeypatch: pytest.MonkeyPatc
         ("CORS_ORIGINS", "https://example.org/path"),
         ("QUOTA_PER_MINUTE", "10"),
         ("LOG_LEVEL", "chatty"),
+        ("MILVUS_URI", "milvus"),
+        ("MILVUS_URI", "milvus:19530"),
+        ("MILVUS_URI", "http://:19530"),
+        ("MILVUS_URI", "http://milvus:port"),
     ],
 )
 def test_nonsense_refuses_to_start(name: str, value: str, monkeypatch: pytest.MonkeyPatch) -> None:

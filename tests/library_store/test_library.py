@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from library_store.descriptor import describe
+from library_store.descriptor import describe, weighted_distance
 from library_store.library import Library, load
 from library_store.prior import PosePrior
 
@@ -51,6 +51,18 @@ def test_equal_weights_are_no_weights(small: Library) -> None:
     for weight in (1.0, 0.5):
         weighted = small.match(points, np.full((5, 14), weight), 10)
         assert_array_equal(weighted.entries, plain.entries)
+
+
+def test_a_complete_query_of_unequal_weights_is_weighted(small: Library) -> None:
+    entries = np.arange(0, len(small), 97)
+    points = projections(small, entries)
+    points += np.random.default_rng(0).normal(size=points.shape) * 0.1 * np.ptp(points)
+    weights = np.random.default_rng(1).uniform(0.05, 1.0, points.shape[:2])
+    found = small.match(points, weights, 5)
+    for row in range(len(entries)):
+        poses = small.descriptors(found.entries[row]).reshape(-1, 14, 2)
+        expected = weighted_distance(points[row], weights[row], poses)
+        assert_allclose(found.distances[row], expected, rtol=1e-4)
 
 
 def test_masked_and_complete_queries_mix(small: Library) -> None:
