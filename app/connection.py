@@ -160,6 +160,8 @@ class Connection(HttpToolsProtocol):
             answer = type(self).early_answer(cast(Scope, cycle.scope))
             if answer is not None:
                 self.transport.write(answer)
+                if isinstance(self.transport, _Sender):
+                    self.transport.flush()
                 cycle.response_started = cycle.response_complete = True
                 cycle.on_response()
                 return
@@ -194,12 +196,12 @@ class _Sender(asyncio.Transport):
     def write(self, data: bytes | bytearray | memoryview[Any]) -> None:
         """Send ``data`` before the loop's next turn."""
         if not self._written:
-            self._loop.call_soon(self._send)
+            self._loop.call_soon(self.flush)
         self._written.append(bytes(data))
 
     def close(self) -> None:
         """Send what is written, then close."""
-        self._send()
+        self.flush()
         self._transport.close()
 
     def abort(self) -> None:
@@ -223,7 +225,8 @@ class _Sender(asyncio.Transport):
         """What the transport knows of its connection."""
         return self._transport.get_extra_info(name, default)
 
-    def _send(self) -> None:
+    def flush(self) -> None:
+        """Send what is written now."""
         data = b"".join(self._written)
         self._written.clear()
         if not data or self._transport.is_closing():

@@ -98,8 +98,23 @@ class Metrics:
         self._networks = Info(
             "posematch_model", "The networks in service", ["kind"], registry=self.registry
         )
+        self._of_requests: dict[tuple[str, str, int], tuple[Counter, Histogram]] = {}
         ProcessCollector(registry=self.registry)
         PlatformCollector(registry=self.registry)
+
+    def count_request(self, route: str, method: str, status: int, spent_s: float) -> None:
+        """Count an answered request."""
+        kind = route, method, status
+        found = self._of_requests.get(kind)
+        if found is None:  # looking labels up costs as much as a refusal may
+            found = (
+                self.requests.labels(route, method, str(status)),
+                self.request_seconds.labels(route),
+            )
+            self._of_requests[kind] = found
+        answered, seconds = found
+        answered.inc()
+        seconds.observe(spent_s)
 
     def count_answer(
         self, source: str, timings_ms: Mapping[str, float], warnings: Iterable[Collection[str]]
@@ -215,8 +230,7 @@ def record_request(
 ) -> None:
     """Count an answered request and log it; ``status`` 0: its client left."""
     method = scope["method"] if scope["method"] in _METHODS else "other"
-    metrics.requests.labels(route, method, str(status or 499)).inc()
-    metrics.request_seconds.labels(route).observe(spent_s)
+    metrics.count_request(route, method, status or 499, spent_s)
     if access_logger.isEnabledFor(logging.INFO):
         access_logger.info(
             "request",
