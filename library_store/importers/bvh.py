@@ -34,7 +34,7 @@ from library_store.skeleton import HEAD_TOP, L_WRIST, LSP14, R_WRIST
 _ZERO = 1e-6
 
 _MOTION = re.compile(
-    r"^\s*MOTION\s+Frames\s*:\s*(?P<frames>\S+)\s+Frame\s+Time\s*:\s*(?P<time_s>\S+)",
+    r"^[ \t]*MOTION\s+Frames\s*:\s*(?P<frames>\S+)\s+Frame\s+Time\s*:\s*(?P<time_s>\S+)",
     re.IGNORECASE | re.MULTILINE,
 )
 _BRACE = re.compile(r"[{}]")
@@ -102,7 +102,7 @@ def parse(path: Path) -> BvhFile:
     """Parse a BVH file; ``MocapError`` says where it is not one."""
     text = _text(path)
     motion = _MOTION.search(text)
-    if motion is None or not text.lstrip().upper().startswith("HIERARCHY"):
+    if motion is None or text.lstrip()[:9].upper() != "HIERARCHY":
         raise MocapError(
             path, "not a BVH file: HIERARCHY and MOTION with Frames and Frame Time expected"
         )

@@ -106,6 +106,7 @@ def test_forward_kinematics_by_hand(tmp_path: Path) -> None:
         ("90 0 0 90 0 0", "90 0 0 nan 0 0", "not finite"),
         ("90 0 0 90 0 0", "90 0 0 x 0 0", "not a whole BVH"),
         ("MOTION", "", "HIERARCHY and MOTION"),
+        ("MOTION", "\n" * 200_000, "HIERARCHY and MOTION"),
         ("Zrotation Xrotation Y", "Zrotation Xrotation Q", "unknown channels"),
         ("OFFSET 1 0 0", "OFFSET 1 0", "not a whole BVH"),
         ("0.04", "0", "frame time"),
