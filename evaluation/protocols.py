@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
+from app.errors import PoseMatchError
 from app.lifting.types import Intrinsics, Observation
 from evaluation.metrics import Floats
 from library_store.skeleton import LSP14
@@ -52,20 +54,32 @@ class LiftingSet:
 
 
 def load_lifting_set(path: Path) -> LiftingSet:
-    """Read an ``.npz`` of ``joints_3d_mm``, ``focal_length_px``, ``joints_2d_px_noise<px>``."""
-    with np.load(path, allow_pickle=False) as data:
-        prefix = "joints_2d_px_noise"
-        points = {
-            int(key.removeprefix(prefix)): data[key].astype(np.float64)
-            for key in data.files
-            if key.startswith(prefix)
-        }
-        return LiftingSet(
-            path.stem,
-            data["joints_3d_mm"].astype(np.float64),
-            dict(sorted(points.items())),
-            Intrinsics(float(data["focal_length_px"]), (0.0, 0.0), "request"),
+    """Read an ``.npz`` of ``joints_3d_mm``, ``focal_length_px``, ``joints_2d_px_noise<px>``.
+
+    Raises ``PoseMatchError`` for any other file.
+    """
+    prefix = "joints_2d_px_noise"
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            points = {
+                int(key.removeprefix(prefix)): data[key].astype(np.float64)
+                for key in data.files
+                if key.startswith(prefix)
+            }
+            truth = data["joints_3d_mm"].astype(np.float64)
+            focal_px = float(data["focal_length_px"])
+    except (KeyError, ValueError, TypeError, AttributeError, EOFError, BadZipFile) as error:
+        raise PoseMatchError(f"{path} is no set of people to lift: {error}") from error
+    if not points or any(it.shape != (*truth.shape[:2], 2) for it in points.values()):
+        raise PoseMatchError(
+            f"{path} is no set of people to lift: wanted is {prefix}0 and the like"
         )
+    return LiftingSet(
+        path.stem,
+        truth,
+        dict(sorted(points.items())),
+        Intrinsics(focal_px, (0.0, 0.0), "request"),
+    )
 
 
 @dataclass(frozen=True)
