@@ -37,13 +37,6 @@ def project(points_mm: Floats, focal_length_px: float, principal_point_px: Float
     return focal_length_px * normalised_projection(points_mm) + principal_point_px
 
 
-def unproject(
-    points_px: Floats, depths_mm: Floats, focal_length_px: float, principal_point_px: Floats
-) -> Floats:
-    """Inverse of :func:`project` at known depth: (..., 2) px and (...) mm -> (..., 3) mm."""
-    return lift_to_depth((points_px - principal_point_px) / focal_length_px, depths_mm)
-
-
 def normalised_projection(points_mm: Floats) -> Floats:
     """(..., 3) camera-frame points -> (..., 2) normalised image coordinates."""
     projected: Floats = points_mm[..., :2] / points_mm[..., 2:]

@@ -3,20 +3,21 @@ import pytest
 
 from app.lifting.geometry import (
     centre_view,
+    lift_to_depth,
     normalised_projection,
     project,
     rotation_onto_axis,
-    unproject,
 )
 
 RNG = np.random.default_rng(0)
 
 
-def test_unproject_undoes_project() -> None:
+def test_lifting_to_its_depth_undoes_projection() -> None:
     points = RNG.normal(size=(50, 14, 3)) * 500 + [0, 0, 4000]
     principal = np.array([319.5, 239.5])
     pixels = project(points, 900.0, principal)
-    np.testing.assert_allclose(unproject(pixels, points[..., 2], 900.0, principal), points)
+    lifted = lift_to_depth((pixels - principal) / 900.0, points[..., 2])
+    np.testing.assert_allclose(lifted, points)
 
 
 @pytest.mark.parametrize("direction", [[0.0, 0.0, 1.0], [0.7, -0.2, 1.0], [-3.0, 2.0, 0.01]])
