@@ -119,7 +119,7 @@ def build(
         return
     try:
         wanted = BuildSettings(
-            name=name or directory.name,
+            name=name or directory.absolute().name,
             n_poses=max(1, size // cameras_per_pose),
             cameras_per_pose=min(cameras_per_pose, size),
             seed=seed,
@@ -185,7 +185,7 @@ def merge(
             manifest = merge_libraries(
                 directory,
                 libraries,
-                name=name or directory.name,
+                name=name or directory.absolute().name,
                 version=version,
                 index=index_settings(size, hnsw),
                 progress=report,
