@@ -1,4 +1,5 @@
-"""A contact sheet of a prior: a row of sampled people for each thing that is done to them.
+"""A contact sheet of a prior: a row of sampled people for each thing that is done to them, as
+libraries have them (of even proportions).
 
 python -m library_store.prior_sheet --out docs/images/prior.png
 """
@@ -28,7 +29,7 @@ def prior_sheet(prior: PosePrior, columns: int, seed: int = 0) -> Image:
     Level cameras 8 degrees above, from three sides in turn. Raises ``ValueError`` when the prior
     makes fewer than ``columns`` people of a kind among 20,000.
     """
-    drawn = prior.draw(20_000, np.random.default_rng(seed))
+    drawn = prior.draw(20_000, np.random.default_rng(seed), evened=True)
     rows = []
     for number, kind in enumerate(KINDS):
         poses = drawn.poses[drawn.kinds == number][:columns]
