@@ -1,5 +1,6 @@
-"""A contact sheet of a prior: a row of sampled people for each thing that is done to them, as
-libraries have them (of even proportions).
+"""A contact sheet of a prior: a row of sampled people for each thing that is done to them.
+
+They are as libraries have them, of even proportions.
 
 python -m library_store.prior_sheet --out docs/images/prior.png
 """
