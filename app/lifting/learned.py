@@ -8,8 +8,9 @@ with the covariance of its errors, so the update is that of any observation:
 
 with P the fused posterior and R the network's covariance. Both have looked at the same 2D joints,
 so their errors are not independent, and neither's are quite as large as it says: κ (``doubt``)
-weighs one against the other. How large the person is stays what the neighbours say; the network
-does not know.
+weighs one against the other. What is left of the covariance is that of a gain so weighed and of
+network errors with twice the covariance that was foretold. How large the person is stays what the
+neighbours say; the network does not know.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from models.pose_lifter import LearnedPose
 
 _SETTLED_PX = 0.1
 """Spread added to each coordinate: a depth relative to the root's has none along the root's."""
+_ERRORS = 2.0
+"""What the foretold covariance of the network's errors is multiplied by to say what is left."""
 _ASTRAY, _FAR_ASTRAY, _CLOSE_PX = 5.0, 8.0, 2.0
 """How many times farther than is usual for this person's joints a misplaced one lies, if the
 neighbours suspect it too and if they do not; and what is added to the usual distance, standard
@@ -67,17 +70,20 @@ def with_learned(
         pose: a Gaussian over states.
         learned: the network's answer in the same view.
         px_per_unit: standard pixels in a normalised unit.
-        doubt: what the covariance of the network's errors is multiplied by.
+        doubt: what the covariance of the network's errors is multiplied by to weigh it.
 
     """
     n = LSP14.n_joints
     to_state = np.concatenate([np.full(2 * n, px_per_unit), np.ones(n)])
     settled = _SETTLED_PX * to_state / px_per_unit
-    error = doubt * to_state[:, None] * learned.covariance * to_state + np.diag(settled**2)
+    error = to_state[:, None] * learned.covariance * to_state
     seen = np.concatenate([px_per_unit * learned.points.ravel(), learned.depths])
-    gain = np.linalg.solve(pose.covariance + error, pose.covariance).T
+    total = pose.covariance + doubt * error + np.diag(settled**2)
+    gain = np.linalg.solve(total, pose.covariance).T
+    # (1 - K) P (1 - K)ᵀ + K R Kᵀ, of another R than K is best for.
+    misjudged = (_ERRORS - doubt) * (gain @ error @ gain.T)
     return LocalPrior(
         pose.mean + gain @ (seen - pose.mean),
-        pose.covariance - gain @ pose.covariance,
+        pose.covariance - gain @ pose.covariance + misjudged,
         pose.root_depth_mm,
     )

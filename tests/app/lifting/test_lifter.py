@@ -16,6 +16,7 @@ from app.lifting.warp import warp_weak_perspective
 from evaluation.metrics import rigid_error_mm, root_centred_error_mm
 from library_store.library import Library
 from library_store.skeleton import LSP14
+from models import PoseLifter
 from tests.app.lifting.conftest import INTRINSICS, People, lift_one, observe, project_px
 
 METHODS: tuple[Method, ...] = ("fusion", "paper")
@@ -258,7 +259,8 @@ def test_nobody_is_behind_the_camera(lifter: Lifter, method: Method) -> None:
         assert (np.abs(person.joints_3d_mm) < 1e6).all()
 
 
-def test_a_joint_far_off_is_set_aside(lifter: Lifter, people: People) -> None:
+def test_a_joint_far_off_is_set_aside(library: Library, people: People) -> None:
+    lifter = Lifter(library, network=PoseLifter())
     pixels = people.joints_px[1].copy()
     pixels[10] += [900.0, -900.0]
     person = lift_one(lifter, observe(pixels))
