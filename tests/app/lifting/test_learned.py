@@ -47,6 +47,27 @@ def test_doubt_goes_from_the_network_to_the_neighbours() -> None:
     assert halfway.root_depth_mm == 4000.0, "the network does not know how large people are"
 
 
+def test_weights_that_are_not_the_best_leave_more_uncertainty() -> None:
+    mean, covariance = gaussian(1, 10.0)
+    said, error = gaussian(2, 10.0)
+    to_unit = np.concatenate([np.full(28, 1.0 / PX_PER_UNIT), np.ones(14)])
+    learned = LearnedPose(
+        (said * to_unit)[:28].reshape(14, 2), said[28:], np.outer(to_unit, to_unit) * error
+    )
+    scale = np.sqrt(np.diag(covariance))
+    left = {
+        doubt: with_learned(
+            LocalPrior(mean, covariance, 4000.0), learned, PX_PER_UNIT, doubt
+        ).covariance
+        / np.outer(scale, scale)
+        for doubt in (0.3, 2.0, 8.0)
+    }
+    for doubt in (0.3, 8.0):
+        assert np.linalg.eigvalsh(left[doubt] - left[2.0]).min() > -1e-9
+        assert np.trace(left[doubt]) > 1.05 * np.trace(left[2.0])
+    assert np.linalg.eigvalsh(left[2.0]).min() > -1e-9
+
+
 def test_it_helps(lifter: Lifter, both: Lifter, people: People) -> None:
     errors = []
     for one in (lifter, both):
