@@ -5,7 +5,8 @@
 a clip), ``up_axis`` and ``license``. What ``write`` makes.
 
 *Human3.6M* ``data_3d_h36m.npz``: ``positions_3d``, an object array that holds subject → action →
-(F, 32 or 17, 3) in metres, Z up, 50 Hz. The neck is H36M's thorax, where the shoulders meet.
+(F, 32 or 17, 3) in metres (some copies: millimetres), Z up, 50 Hz. The neck is H36M's thorax, where
+the shoulders meet.
 
 *HumanEva* ``data_3d_humaneva15.npz``: the same with 15 joints, 60 Hz.
 
@@ -39,6 +40,8 @@ SMPL = (15, 12, 17, 19, 21, 16, 18, 20, 2, 5, 8, 1, 4, 7)
 
 HUMANEVA_HZ = 60.0
 _MM_PER_M = 1000.0
+_LARGEST_M = 20.0
+"""Nobody's joints lie farther apart in metres; in millimetres everybody's do."""
 _LAST_FRAME = 2**31 - 1
 """Libraries keep frame numbers in four bytes."""
 
@@ -182,7 +185,8 @@ def _read_nested(path: Path, npz: NpzFile) -> list[Clip]:
                     path, f"{subject} {action} is {positions.shape}; wanted are {shapes} joints"
                 )
             dataset, order, rate_hz, licence = _NESTED[joints]
-            positions, _ = _with_y_up(path, positions[:, order] * _MM_PER_M, "Z")
+            unit, mm_per_unit = _metric_unit(positions)
+            positions, _ = _with_y_up(path, positions[:, order] * mm_per_unit, "Z")
             clip = Clip(
                 name=f"{subject}_{action}".replace(" ", "_").replace("/", "_"),
                 subject=str(subject),
@@ -190,11 +194,20 @@ def _read_nested(path: Path, npz: NpzFile) -> list[Clip]:
                 frame_rate_hz=rate_hz,
                 positions_mm=positions.astype(np.float32),
                 frames=np.arange(len(positions), dtype=np.int64),
-                findings=(f"{dataset}, {joints} joints: metres, Z up",),
+                findings=(f"{dataset}, {joints} joints: {unit}, Z up",),
                 licence=licence,
             )
             clips.append(checked(path, clip, up_is_known=True, bones_are_known=True))
     return clips
+
+
+def _metric_unit(positions: Float) -> tuple[str, float]:
+    """Metres or millimetres, whichever makes people (F, J, 3) of a person's size, and its mm."""
+    extents = np.ptp(positions, axis=1).max(axis=-1)
+    sizes = extents[np.isfinite(extents)]
+    if len(sizes) and np.median(sizes) > _LARGEST_M:
+        return "millimetres", 1.0
+    return "metres", _MM_PER_M
 
 
 def _read_smpl(path: Path, npz: NpzFile) -> Clip:

@@ -70,6 +70,14 @@ def test_nested_positions(
     assert "only" in clips[0].licence
 
 
+def test_nested_positions_in_millimetres_are_seen_to_be_so(tmp_path: Path, poses: Float) -> None:
+    values = 1000 * spread(poses, H36M_32, 32)
+    values[0, 3] = np.nan
+    (clip,) = read(nested(tmp_path / "data_3d.npz", {"S1": {"Walking": values}}))
+    assert_allclose(clip.positions_mm, poses[1:], atol=0.01)
+    assert any("millimetres" in finding for finding in clip.findings)
+
+
 class _Evil:
     def __init__(self, file: Path) -> None:
         self.file = file
