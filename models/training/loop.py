@@ -14,6 +14,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -65,11 +66,14 @@ class Feeder:
     def __init__(self, make: Callable[[int], Batch], steps: range) -> None:
         self._make, self._steps = make, steps
         self._queue: queue.Queue[Batch | BaseException] = queue.Queue(4)
+        self._closed = threading.Event()
         threading.Thread(target=self._run, daemon=True).start()
 
     def _run(self) -> None:
         try:
             for step in self._steps:
+                if self._closed.is_set():
+                    return
                 self._queue.put(self._make(step))
         except BaseException as error:  # handed to the training thread, which raises it
             self._queue.put(error)
@@ -80,6 +84,13 @@ class Feeder:
             if isinstance(item, BaseException):
                 raise item
             yield item
+
+    def close(self) -> None:
+        """Make no more; what is made and not taken is dropped."""
+        self._closed.set()
+        with suppress(queue.Empty):
+            while True:
+                self._queue.get_nowait()
 
 
 def _average_into(ema: nn.Module, model: nn.Module, decay: float) -> None:
@@ -144,9 +155,12 @@ def fit(
         by_time = (time.monotonic() - started) / (60 * args.minutes) if args.minutes else 0.0
         return max(step / args.steps, by_time)
 
+    def size_now() -> int:
+        return next((size for until, size in sizes if progress() <= until), sizes[-1][1])
+
     running = math.nan
     while progress() < 1:
-        size = next((size for until, size in sizes if progress() <= until), sizes[-1][1])
+        size = size_now()
         mark, mark_step = time.monotonic(), step
         feeder = Feeder(partial(make_batch, size=size), range(step, step + args.every))
         for batch in feeder:
@@ -164,8 +178,9 @@ def fit(
             value = float(loss.detach())
             running = value if math.isnan(running) else 0.98 * running + 0.02 * value
             step += 1
-            if progress() >= 1:
+            if progress() >= 1 or size_now() != size:
                 break
+        feeder.close()
         rate = (step - mark_step) * args.batch / (time.monotonic() - mark)
         line = {
             "step": step,

@@ -1,0 +1,42 @@
+"""The training loop's schedule; needs torch, so it runs where the training extra is installed."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from models.training import loop  # noqa: E402
+
+
+def test_input_grows_at_its_share_of_the_run_whatever_the_evaluations(tmp_path: Path) -> None:
+    parser = argparse.ArgumentParser()
+    loop.add_arguments(parser)
+    options = "--steps 20 --every 50 --batch 4 --threads 1 --optimizer adamw"
+    args = parser.parse_args(["--data", "x", "--out", str(tmp_path), *options.split()])
+    sizes = []
+    threads = threading.active_count()
+
+    def loss_of(model: Any, batch: loop.Batch) -> Any:
+        sizes.append(batch[0].shape[-1])
+        return model(batch[0]).pow(2).mean()
+
+    loop.fit(
+        torch.nn.Conv2d(3, 4, 3),
+        args,
+        sizes=[(0.3, 8), (1.0, 16)],
+        make_batch=lambda _, size: (torch.zeros(4, 3, size, size),),
+        loss_of=loss_of,
+        evaluate=lambda _, __: {},
+        config={},
+    )
+    assert sizes == [8] * 7 + [16] * 13
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [(line["step"], line["size_px"]) for line in lines] == [(7, 8), (20, 16)]
+    assert threading.active_count() == threads
