@@ -12,7 +12,7 @@ from models.person_detector import PersonBox
 SURE_JOINTS, LEAST_BELIEF = 5, 0.31
 """Least product of the box's score and the mean confidence of that many best joints. Of a face and
 shoulders alone five joints are sure; of a chair or a raised arm the two networks seldom err
-together, where either alone would. It keeps 99.6% of the boxes that a teacher confirms in 350
+together, where either alone would. It keeps 99.4% of the boxes that a teacher confirms in 350
 scenes and drops half of those that show nobody in mosaics (models.training.presence_threshold)."""
 SAME_PERSON = 0.1
 """Mean distance of two people's joints, over the larger extent, below which they are one."""
