@@ -6,10 +6,16 @@ import signal
 
 
 def main() -> None:
-    """Run the command; Ctrl-C ends it quietly from the first moment on (130 in a shell)."""
+    """Run the command; Ctrl-C ends it quietly from the first moment on (130 in a shell).
+
+    Where it is to be ignored, as in the background of a script, it stays so.
+    """
     # The imports take a second: a traceback from amidst them would tell nobody anything.
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if heard:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
     from app import cli
 
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if heard:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     cli.main()

@@ -18,6 +18,7 @@ import pytest
 
 from app.main import create_app
 from app.settings import Settings
+from app.version import VERSION
 from models.card import WEIGHTS_DIR
 from tests.app.server import COMMAND, Server, environment
 
@@ -43,16 +44,33 @@ def test_bad_settings(tmp_path: Path) -> None:
     assert "POSEMATCH_WORKERS" in refusal(tmp_path, worker=1), "a hint at the right name"
 
 
+def await_numpy(pid: int) -> None:
+    """Until the process is amidst its imports."""
+    while "numpy" not in Path(f"/proc/{pid}/maps").read_text():
+        time.sleep(0.005)
+
+
 def test_control_c_while_it_still_imports() -> None:
     command: list[str | Path] = [COMMAND, "serve", "--port", "0"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        loaded = Path(f"/proc/{process.pid}/maps")
-        while "numpy" not in loaded.read_text():
-            time.sleep(0.005)
+        await_numpy(process.pid)
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=60)
     assert said == ""
     assert process.returncode == -signal.SIGINT, "which a shell calls 130"
+
+
+def test_control_c_is_ignored_where_the_shell_says_so() -> None:
+    """In the background of a script: it is meant for what runs in the foreground."""
+    command = ["sh", "-c", f"trap '' INT; exec {COMMAND} version"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        await_numpy(process.pid)
+        while process.poll() is None:
+            process.send_signal(signal.SIGINT)
+            time.sleep(0.02)
+        assert process.stdout is not None
+        assert process.stdout.read().strip() == VERSION
+    assert process.returncode == 0
 
 
 def test_an_address_that_is_taken(tmp_path: Path, library_dir: Path) -> None:
