@@ -348,7 +348,7 @@ def import_mocap(
     write_npz(out, kept)
     output.print(_clips_table(kept))
     poses = sum(len(clip) for clip in kept)
-    total = f"{len(kept)} clips, {poses} poses; {n_skipped} files skipped"
+    total = f"{len(kept)} clips, {poses} poses; {n_skipped} skipped"
     output.print(f"{out}: {total}", highlight=False, markup=False, soft_wrap=True)
 
 

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from library_store.importers.asf_amc import CMU_LICENCE, describe_cmu
-from library_store.importers.checks import checked
+from library_store.importers.checks import checked_or_error
 from library_store.importers.clip import Clip, Float, MocapError
 from library_store.importers.joint_tables import JointMapping, read_mapping
 from library_store.importers.markers import (
@@ -66,11 +66,14 @@ class C3dFile:
     findings: tuple[str, ...]
 
 
-def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
-    """The clips of a C3D file, one a person; ``mapping`` is a table from joint to markers."""
+def read(path: Path, *, mapping: Path | None = None) -> list[Clip | MocapError]:
+    """The clips of a C3D file, one a person, or what is wrong with that person's.
+
+    ``mapping`` is a table from joint to markers.
+    """
     table = read_mapping(mapping) if mapping else None
     file = parse(path)
-    clips: list[Clip] = []
+    clips: list[Clip | MocapError] = []
     left_out: list[str] = []
     for person, markers in file.people.items():
         named = _joints_of(markers, table, sizes_from(file.stated), file.rate_hz)
@@ -93,7 +96,7 @@ def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
             findings=(f"markers: {marker_set}", *file.findings, *findings),
             licence=CMU_LICENCE if subject else "",
         )
-        clips.append(checked(path, clip, up_is_known=bool(file.up)))
+        clips.append(checked_or_error(path, clip, up_is_known=bool(file.up)))
     if not clips:
         there = ", ".join(f"{p}:{m}" if p else m for p, ms in file.people.items() for m in ms)
         known = "; ".join(f"{known.name} ({' '.join(known.markers)})" for known in MARKER_SETS)
@@ -106,7 +109,10 @@ def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
         raise MocapError(path, f"markers are {there[:500] or 'none'}. {advice}")
     if left_out:
         finding = f"left out, not the markers of a person: {', '.join(left_out)}"
-        clips = [replace(clip, findings=(*clip.findings, finding)) for clip in clips]
+        clips = [
+            replace(it, findings=(*it.findings, finding)) if isinstance(it, Clip) else it
+            for it in clips
+        ]
     return clips
 
 

@@ -98,7 +98,10 @@ def checked(
     if not keep.all():
         findings.append(f"{np.count_nonzero(~keep)} frames with missing joints dropped")
     if not keep.any():
-        raise MocapError(path, f"clip {clip.name!r} has no frame with all 14 joints")
+        seen = np.flatnonzero(np.isfinite(positions).all(axis=2).any(axis=0))
+        names = [name for joint, name in enumerate(LSP14.joint_names) if joint not in seen]
+        never = f"; never there: {', '.join(names)}" if names else ""
+        raise MocapError(path, f"clip {clip.name!r} has no frame with all 14 joints{never}")
     positions, frames = positions[keep], clip.frames[keep]
     if starts_with_t_pose(positions):
         findings.append("the first frame is a T-pose: dropped")
@@ -137,6 +140,16 @@ def checked(
         frames=frames,
         findings=tuple(dict.fromkeys(findings)),  # those of an earlier import only once
     )
+
+
+def checked_or_error(
+    path: Path, clip: Clip, *, up_is_known: bool = False, bones_are_known: bool = False
+) -> Clip | MocapError:
+    """What ``checked`` returns or raises: of a file of several clips one may be beyond use."""
+    try:
+        return checked(path, clip, up_is_known=up_is_known, bones_are_known=bones_are_known)
+    except MocapError as error:
+        return error
 
 
 def starts_with_t_pose(positions: Float) -> bool:

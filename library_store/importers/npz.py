@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from library_store.importers.checks import checked
+from library_store.importers.checks import checked, checked_or_error
 from library_store.importers.clip import Clip, Float, Frames, MocapError
 from library_store.importers.h36m import H36M_32, H36M_HZ, H36M_LICENCE
 from library_store.importers.head import put_head_top
@@ -55,8 +55,8 @@ _NESTED = {
 }
 
 
-def read(path: Path) -> list[Clip]:
-    """All clips of an npz file; the form is told from its arrays' names."""
+def read(path: Path) -> list[Clip | MocapError]:
+    """All clips of an npz file, or what is wrong with one; its arrays' names tell the form."""
     npz = NpzFile(path)
     if "positions_3d" in npz:
         return _read_nested(path, npz)
@@ -124,7 +124,7 @@ def states_licence(path: Path) -> bool:
     return bool(npz.text("license")) or ("clip_license" in npz and all(npz.column("clip_license")))
 
 
-def _read_generic(path: Path, npz: NpzFile) -> list[Clip]:
+def _read_generic(path: Path, npz: NpzFile) -> list[Clip | MocapError]:
     positions = _numbers(path, "positions", npz["positions"])
     n = len(positions)
     if positions.shape != (n, LSP14.n_joints, 3) or n == 0:
@@ -144,7 +144,7 @@ def _read_generic(path: Path, npz: NpzFile) -> list[Clip]:
     columns = {name: npz.column(f"clip_{name}") for name in _CLIP_COLUMNS}
     if number.min() < 0 or any(c and len(c) <= number.max() for c in columns.values()):
         raise MocapError(path, f"clip numbers {number.min()} to {number.max()} are not all named")
-    clips = []
+    clips: list[Clip | MocapError] = []
     for i in np.unique(number):
         own = number == i
         said = {name: column[i] if column else "" for name, column in columns.items()}
@@ -163,18 +163,18 @@ def _read_generic(path: Path, npz: NpzFile) -> list[Clip]:
             findings=tuple(said["findings"].splitlines()),
             licence=said["license"] or npz.text("license"),
         )
-        clips.append(checked(path, clip, up_is_known=up_is_known))
+        clips.append(checked_or_error(path, clip, up_is_known=up_is_known))
     return clips
 
 
-def _read_nested(path: Path, npz: NpzFile) -> list[Clip]:
+def _read_nested(path: Path, npz: NpzFile) -> list[Clip | MocapError]:
     held = npz["positions_3d"]
     subjects = held.item() if held.dtype == object and held.size == 1 else None
     if not isinstance(subjects, dict) or not all(isinstance(v, dict) for v in subjects.values()):
         raise MocapError(path, "positions_3d must hold a dict subject → action → positions")
     if not any(subjects.values()):
         raise MocapError(path, "positions_3d holds no positions")
-    clips = []
+    clips: list[Clip | MocapError] = []
     for subject, actions in subjects.items():
         for action, values in actions.items():
             positions = _numbers(path, f"{subject} {action}", values)
@@ -197,7 +197,7 @@ def _read_nested(path: Path, npz: NpzFile) -> list[Clip]:
                 findings=(f"{dataset}, {joints} joints: {unit}, Z up",),
                 licence=licence,
             )
-            clips.append(checked(path, clip, up_is_known=True, bones_are_known=True))
+            clips.append(checked_or_error(path, clip, up_is_known=True, bones_are_known=True))
     return clips
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,20 @@ def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
     Raises ``MocapError`` for a file that is missing, malformed or of a person no unit fits; nothing
     of such a file is returned.
     """
-    importers: dict[str, Callable[[], list[Clip]]] = {
+    clips: list[Clip] = []
+    for it in _read_file(path, mapping):
+        if isinstance(it, MocapError):
+            raise it
+        clips.append(it)
+    return clips
+
+
+def _read_file(path: Path, mapping: Path | None) -> Sequence[Clip | MocapError]:
+    """The clips of one file, and what is wrong with those that cannot be used.
+
+    Raises ``MocapError`` where the file itself is missing or malformed.
+    """
+    importers: dict[str, Callable[[], Sequence[Clip | MocapError]]] = {
         ".amc": lambda: [asf_amc.read(path)],
         ".bvh": lambda: [bvh.read(path, mapping=mapping)],
         ".c3d": lambda: c3d.read(path, mapping=mapping),
@@ -50,19 +63,23 @@ def find_files(paths: Iterable[Path]) -> Iterator[Path]:
 def read_each(
     paths: Iterable[Path], *, mapping: Path | None = None, strict: bool = False
 ) -> Iterator[Clip | MocapError]:
-    """The clips of all files and folders one by one, and the error of each file that is skipped.
+    """The clips of all files and folders one by one, and the error of each that is skipped.
 
-    With ``strict`` the first such error is raised instead; that of a bad ``mapping`` always is.
+    Skipped is a malformed file as a whole; of a sound one with several people or clips, those that
+    cannot be used. With ``strict`` the first such error is raised instead; that of a bad
+    ``mapping`` always is.
     """
     if mapping is not None:
         read_mapping(mapping)
     for path in find_files(paths):
         try:
-            yield from read(path, mapping=mapping)
+            found = _read_file(path, mapping)
         except MocapError as error:
-            if strict:
-                raise
-            yield error
+            found = [error]
+        for it in found:
+            if strict and isinstance(it, MocapError):
+                raise it
+            yield it
 
 
 def read_all(

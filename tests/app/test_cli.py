@@ -175,7 +175,7 @@ def test_library_import(tmp_path: Path) -> None:
     out.parent.mkdir()
     done = run("library", "import", tmp_path, "--out", out)
     assert done.returncode == 0, done.stderr
-    assert "1 clips, 3 poses; 1 files skipped" in done.stdout
+    assert "1 clips, 3 poses; 1 skipped" in done.stdout
     assert "bad.bvh: not a BVH file" in done.stderr
     with np.load(out) as written:
         assert written["positions"].shape == (3, 14, 3)

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from library_store.anatomy import root_of
-from library_store.importers import MocapError, read
+from library_store.importers import MocapError, read, read_all
 from library_store.importers.markers import MARKER_SETS, Sizes, joint_centres
 from library_store.importers.rotation import about_axis
 from library_store.skeleton import LSP14
@@ -58,6 +58,27 @@ def test_who_is_left_out_is_said(tmp_path: Path) -> None:
     assert (clip.name, clip.subject) == ("pair_Ann", "Ann")
     finding = "left out, not the markers of a person: Box, markers without a prefix"
     assert finding in clip.findings
+
+
+def test_a_person_never_seen_is_named_and_skipped(tmp_path: Path) -> None:
+    """The others of the file are read; strict refuses them all."""
+    ann = {f"Ann:{name}": track for name, track in TRACKS.items()}
+    bob = {f"Bob:{name}": np.full_like(track, np.nan) for name, track in TRACKS.items()}
+    eve = {f"Eve:{name}": track.copy() for name, track in TRACKS.items()}
+    eve["Eve:LKNE"][:] = np.nan
+    path = write_c3d(tmp_path / "trio.c3d", ann | bob | eve)
+    (clip,), skipped = read_all([path])
+    assert clip.name == "trio_Ann"
+    assert_allclose(clip.positions_mm, TRUTH, atol=0.02)
+    assert [str(error).startswith(f"{path}: clip 'trio_") for error in skipped] == [True, True]
+    assert "'trio_Bob' has no frame with all 14 joints; never there: head_top" in str(skipped[0])
+    assert str(skipped[1]).endswith(
+        "'trio_Eve' has no frame with all 14 joints; never there: l_knee, l_ankle"
+    )
+    with pytest.raises(MocapError, match="trio_Bob"):
+        read_all([path], strict=True)
+    with pytest.raises(MocapError, match="trio_Bob"):
+        read(path)
 
 
 def test_an_axis_that_is_not_stated_is_found(tmp_path: Path) -> None:

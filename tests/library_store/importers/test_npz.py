@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from library_store.anatomy import Float, root_of
-from library_store.importers import Clip, MocapError, read
+from library_store.importers import Clip, MocapError, read, read_all
 from library_store.importers.h36m import H36M_32
 from library_store.importers.npz import H36M_17, HUMANEVA_15, SMPL, states_licence, write
 from library_store.skeleton import HEAD_TOP, LSP14, NECK
@@ -76,6 +76,21 @@ def test_nested_positions_in_millimetres_are_seen_to_be_so(tmp_path: Path, poses
     (clip,) = read(nested(tmp_path / "data_3d.npz", {"S1": {"Walking": values}}))
     assert_allclose(clip.positions_mm, poses[1:], atol=0.01)
     assert any("millimetres" in finding for finding in clip.findings)
+
+
+def test_a_clip_of_nobody_does_not_cost_the_others(tmp_path: Path, poses: Float) -> None:
+    values = spread(poses, H36M_32, 32)
+    clips = {"Eating": np.full_like(values, np.nan), "Walking": values, "Waiting": values * 3e-4}
+    (clip,), skipped = read_all([nested(tmp_path / "data_3d.npz", {"S1": clips})])
+    assert clip.action == "Walking"
+    assert "clip 'S1_Eating' has no frame" in str(skipped[0])
+    assert "clip 'S1_Waiting': trunk + thigh + shank is" in str(skipped[1])
+    generic = tmp_path / "clips.npz"
+    number = np.repeat([0, 1], len(poses))
+    np.savez(generic, positions=np.concatenate([poses, np.nan * poses]), clip=number)
+    (clip,), (error,) = read_all([generic])
+    assert clip.name == "clips_0"
+    assert "clip 'clips_1' has no frame" in str(error)
 
 
 class _Evil:
