@@ -48,7 +48,7 @@ class BuildSettings:
     ``n_poses`` poses are drawn and each seen by ``cameras_per_pose`` cameras of its own. Sample i
     depends on the seed, the prior and i only: a smaller library is the beginning of a larger one.
     With mocap their product is the number of exemplars in all; captured poses get as many cameras
-    as it takes. ``version`` is free text; by default the prior's, or 1.
+    as it takes. ``version`` is free text; by default the prior's and the recipe's, or 1 with mocap.
     """
 
     name: str = "default"
@@ -119,7 +119,7 @@ def build_key(prior: PosePrior | None, settings: BuildSettings, mocap: Mocap | N
     """Digest of everything that decides a library's content. Reads the files of mocap."""
     inputs: dict[str, Any] = {
         "prior": prior.sha256 if prior else None,
-        "settings": asdict(settings),
+        "settings": asdict(settings) | {"version": _version(prior, settings, mocap)},
         "recipe": RECIPE,
         "format": FORMAT,
     }
@@ -243,12 +243,19 @@ def _fill(
         workshop,
         report,
         name=settings.name,
-        version=settings.version or (prior.card.version if prior and not mocap else "1"),
+        version=_version(prior, settings, mocap),
         licences=licences,
         build=build,
         index=write_index(steps, workshop, settings.index, report),
         counts={**posed, **seen},
     )
+
+
+def _version(prior: PosePrior | None, settings: BuildSettings, mocap: Mocap | None) -> str:
+    """What is asked for; else, e.g. 2.3, the prior's and the recipe's: either makes other poses."""
+    if settings.version:
+        return settings.version
+    return f"{prior.card.version}.{RECIPE}" if prior and not mocap else "1"
 
 
 def _describe(settings: MocapSettings, n_captured: int, n_composed: int) -> dict[str, Facts]:

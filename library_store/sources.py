@@ -35,8 +35,7 @@ MIRRORED = "~mirrored"
 """Ends the name of a mirrored clip's group. Clips' own names have no ``~``."""
 
 PART_NAMES: tuple[PartName, ...] = ("legs", "upper_body")
-PART_COLUMNS = ("clip", "frame", "mirrored")
-"""``parts.npy`` is (composed poses, 2 parts, 3) int32: clip number, frame, 0 or 1."""
+"""In ``parts.npy``'s order; that is (composed poses, 2, 3) int32: clip number, frame, mirrored."""
 
 
 @dataclass(frozen=True)

@@ -99,7 +99,7 @@ def build(
     ] = "",
     credit: Annotated[str, typer.Option(help="Whom to credit for them.")] = "",
     name: Annotated[str, typer.Option(help="In exemplar ids; default the directory's.")] = "",
-    version: Annotated[str, typer.Option(help="Default the prior's, or 1.")] = "",
+    version: Annotated[str, typer.Option(help="Default the prior's and the recipe's, or 1.")] = "",
     seed: Annotated[int, typer.Option(min=0, help="Another seed gives other poses.")] = 0,
     hnsw: HnswOption = None,
 ) -> None:

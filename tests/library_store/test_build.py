@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from library_store import publish
+from library_store import build, publish
 from library_store.backends import IndexSettings
 from library_store.build import (
     BuildSettings,
@@ -220,6 +220,20 @@ def test_the_key_covers_everything_the_library_is_made_of(prior: PosePrior) -> N
         build_key(prior, replace(TINY, index=IndexSettings(rows_per_cell=20))),
     }
     assert len(keys) == 6
+
+
+def test_another_recipe_is_another_version(
+    tiny: Path, prior: PosePrior, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    version = describe_library(tiny).version
+    assert version == f"{prior.card.version}.{build.RECIPE}"
+    key = build_key(prior, TINY)
+    monkeypatch.setattr(build, "RECIPE", build.RECIPE + 1)
+    assert build_key(prior, TINY) != key
+    few = BuildSettings(n_poses=9)
+    assert build_library(tmp_path / "next", prior, few).version not in ("", version)
+    named = replace(few, version="mine")
+    assert build_library(tmp_path / "named", prior, named).version == "mine"
 
 
 def test_settings_that_make_no_library_are_refused() -> None:
