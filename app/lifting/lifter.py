@@ -40,6 +40,9 @@ MIN_TRUNK_JOINTS = 2
 TRUNK = (NECK, R_SHOULDER, L_SHOULDER, R_HIP, L_HIP)
 MIN_EXTENT_PX = 8.0
 """Larger side of the joints' bounding box, pixels of the photo."""
+MIN_BREADTH = 0.02
+"""Spread of the joints across over along their line; 0.04 is the least of the hips and legs alone
+in 50,000 exemplars, 0.08 of all joints."""
 MAX_SPREAD_DEG = 70.0
 """Angle of a joint's ray from the person's centre: wider, and no camera has seen them whole."""
 MAX_OFF_AXIS_DEG = 85.0
@@ -365,6 +368,10 @@ def _why_not_liftable(joints_px: Floats, confidence: Floats) -> str | None:
         )
     if np.ptp(joints_px[present], axis=0).max() < MIN_EXTENT_PX:
         return f"the joints lie within {MIN_EXTENT_PX:g} pixels of each other"
+    centred = joints_px[present] - joints_px[present].mean(axis=0)
+    along, across = np.linalg.svd(centred, compute_uv=False)
+    if across < MIN_BREADTH * along:
+        return "the joints lie on one line: nobody is seen as thin as that"
     return None
 
 

@@ -220,6 +220,17 @@ def test_joints_on_one_spot_are_not_lifted(lifter: Lifter) -> None:
     assert isinstance(answer, NotLiftable)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_joints_on_one_line_are_not_lifted(lifter: Lifter, people: People, method: Method) -> None:
+    joints_px = people.joints_px[0].copy()
+    thin = joints_px * (0.2, 1.0)
+    joints_px[:, 0] = 0.5 * joints_px[:, 1] + np.tile((0.0, 1.0), 7)
+    answers = lifter.lift([observe(joints_px), observe(thin)], INTRINSICS, method=method)
+    assert isinstance(answers[0], NotLiftable)
+    assert "one line" in answers[0].reason
+    assert isinstance(answers[1], LiftedPerson)
+
+
 @pytest.mark.parametrize(
     ("focal_length_px", "centre_px", "reason"),
     [
