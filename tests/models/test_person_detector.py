@@ -2,8 +2,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
-from models.person_detector import PersonDetector, decode, iou
+from models.person_detector import PersonDetector, decode, iou, shrunk
 
 PHOTO = Path(__file__).parents[1] / "data" / "renders" / "014.jpg"
 
@@ -69,3 +70,16 @@ def test_boxes_are_in_the_pixels_of_the_photo_given() -> None:
     np.testing.assert_allclose([other.x_px, other.y_px], (first + 0.5) * 2 - 0.5, atol=1e-3)
     size = np.array([box.width_px, box.height_px])
     np.testing.assert_allclose([other.width_px, other.height_px], 2 * size, rtol=1e-5)
+
+
+@pytest.mark.parametrize("side", [24, 47, 64, 65, 131, 200, 255])
+def test_a_shrunk_photo_keeps_its_pixels_in_place(side: int) -> None:
+    """In a ramp each pixel says where it was: also of sizes that cannot be halved exactly."""
+    ramp = np.arange(side, dtype=np.uint8)
+    photo = np.stack([*np.meshgrid(ramp, ramp), np.zeros((side, side), np.uint8)], -1)
+    canvas, (width, height) = shrunk(np.asarray(photo, np.uint8), 32)
+    assert (width, height) == (32, 32)
+    meant = (np.arange(32) + 0.5) * side / 32 - 0.5
+    inner = slice(1, -1)  # beyond the outermost pixels' centres there is nothing to blend with
+    np.testing.assert_allclose(canvas[16, inner, 0], meant[inner], atol=1.5)
+    np.testing.assert_allclose(canvas[inner, 16, 1], meant[inner], atol=1.5)
