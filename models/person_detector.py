@@ -83,7 +83,7 @@ def shrunk(
     scale = long_side_px / max(height, width)
     small_w, small_h = max(1, round(width * scale)), max(1, round(height * scale))
     # Halving is ten times as fast as other averages over areas; what is left to shrink, less than
-    # by half, needs none. An odd last row or column is dropped.
+    # by half, needs none. An odd last row or column is dropped: less than a pixel of the canvas.
     while min(height / small_h, width / small_w) >= 2:
         height, width = height // 2, width // 2
         even = image[: 2 * height, : 2 * width]
