@@ -330,6 +330,8 @@ def import_mocap(
     """Read motion capture files as 14-joint poses in mm, Y up, and say what was noticed."""
     if out.suffix.lower() != ".npz":
         raise typer.BadParameter("must end in .npz", param_hint="--out")
+    if not out.absolute().parent.is_dir():  # said before hours of reading, not after
+        raise typer.BadParameter(f"there is no folder {out.parent}", param_hint="--out")
     if out.resolve() in {path.resolve() for path in find_files(paths)}:
         raise typer.BadParameter(
             f"{out} is among what is read: write it elsewhere", param_hint="--out"

@@ -16,6 +16,7 @@ from __future__ import annotations
 import codecs
 import csv
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -115,9 +116,12 @@ def read(path: Path, *, skeleton: Path | None = None) -> Clip:
 
 
 def find_skeleton(path: Path) -> Path:
-    """The ASF of an AMC: the one its name begins with, or the only one in the folder."""
+    """The ASF of an AMC: the one its name begins with, or the only one in the folder.
+
+    ``10.asf`` is that of ``10_01.amc``, not of ``105_01.amc``, which may lie beside it.
+    """
     here = sorted(p for p in path.parent.iterdir() if p.suffix.lower() == ".asf")
-    named = [p for p in here if path.stem.startswith(p.stem)]
+    named = [p for p in here if re.match(rf"{re.escape(p.stem)}(?![A-Za-z0-9])", path.stem)]
     if len(named) != 1 and len(here) != 1:
         found = ", ".join(p.name for p in here) or "none"
         raise MocapError(path, f"its ASF skeleton must lie in the same folder; found: {found}")
@@ -188,8 +192,12 @@ def read_asf(path: Path) -> SkeletonFile:
             mm_per_unit=MM_PER_INCH / length,
             degrees_per_angle=degrees,
         )
-    except (KeyError, IndexError, ValueError) as error:
-        raise MocapError(path, f"not a whole ASF skeleton ({error!r})") from error
+    except KeyError as error:
+        raise MocapError(path, f"not a whole ASF skeleton: it has no {error}") from error
+    except IndexError as error:
+        raise MocapError(path, "not a whole ASF skeleton: a line ends too soon") from error
+    except ValueError as error:
+        raise MocapError(path, f"not a whole ASF skeleton: {error}") from error
 
 
 def _text(path: Path) -> str:
@@ -253,14 +261,16 @@ def read_amc(path: Path, asf: SkeletonFile) -> tuple[Frames, dict[str, Float]]:
         try:
             if len(words) == 1:
                 frames.append(int(words[0]))
+            elif words[0] not in widths:
+                raise ValueError("its skeleton has no such bone, or none that turns")
             elif len(words) - 1 != widths[words[0]] or not frames:
                 raise ValueError(f"{widths[words[0]]} values expected")
             else:
                 values[words[0]].append([float(word) for word in words[1:]])
                 if len(values[words[0]]) != len(frames):
                     raise ValueError("the bone is missing in a frame before, or is here twice")
-        except (ValueError, KeyError) as error:
-            raise MocapError(path, f"line {number}: {line.strip()!r}: {error!r}") from error
+        except ValueError as error:
+            raise MocapError(path, f"line {number}: {line.strip()!r}: {error}") from error
     short = [name for name, rows in values.items() if len(rows) != len(frames)]
     if not frames or short:
         raise MocapError(path, f"{len(frames)} frames, not all with values for {short or 'a bone'}")

@@ -110,8 +110,10 @@ def parse(path: Path) -> BvhFile:
         joints = _parse_hierarchy(_BRACE.sub(r" \g<0> ", text[: motion.start()]).split()[1:])
         n_frames, frame_time_s = int(motion["frames"]), float(motion["time_s"])
         values = np.array(text[motion.end() :].split(), dtype=np.float64)
-    except (ValueError, IndexError, StopIteration) as error:
-        raise MocapError(path, f"not a whole BVH file ({error!r})") from error
+    except (IndexError, StopIteration) as error:
+        raise MocapError(path, "not a whole BVH file: its braces do not match") from error
+    except ValueError as error:
+        raise MocapError(path, f"not a whole BVH file: {error}") from error
     width = sum(len(joint.channels) for joint in joints)
     if n_frames < 1 or values.size != n_frames * width:
         raise MocapError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from library_store.importers.clip import Clip, MocapError
 from library_store.importers.joint_tables import read_mapping
 
 SUFFIXES = (".amc", ".bvh", ".c3d", ".cdf", ".npz")
+_ARCHIVES = (".zip", ".gz", ".tgz", ".bz2", ".xz", ".tar", ".7z", ".rar")
 
 
 def read(path: Path, *, mapping: Path | None = None) -> list[Clip]:
@@ -42,7 +44,9 @@ def _read_file(path: Path, mapping: Path | None) -> Sequence[Clip | MocapError]:
     }
     importer = importers.get(path.suffix.lower())
     if importer is None:
-        raise MocapError(path, f"not a kind of file that can be imported: {', '.join(SUFFIXES)}")
+        problem = f"not a kind of file that can be imported: {', '.join(SUFFIXES)}"
+        packed = path.suffix.lower() in _ARCHIVES
+        raise MocapError(path, f"{problem}; unpack it first" if packed else problem)
     try:
         # Damaged numbers overflow to infinity; the checks then drop their frames.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -52,12 +56,25 @@ def _read_file(path: Path, mapping: Path | None) -> Sequence[Clip | MocapError]:
 
 
 def find_files(paths: Iterable[Path]) -> Iterator[Path]:
-    """The files given, and those below the folders given that an importer would take, in order."""
+    """The files given, and those below the folders given that an importer would take, in order.
+
+    Links to folders are followed, to each folder once.
+    """
     for path in paths:
         if path.is_dir():
-            yield from sorted(p for p in path.rglob("*") if p.suffix.lower() in SUFFIXES)
+            yield from sorted(p for p in _below(path) if p.suffix.lower() in SUFFIXES)
         else:
             yield path
+
+
+def _below(folder: Path) -> Iterator[Path]:
+    entered: set[str] = set()
+    for place, folders, files in os.walk(folder, followlinks=True):
+        if os.path.realpath(place) in entered:
+            folders.clear()
+            continue
+        entered.add(os.path.realpath(place))
+        yield from (Path(place, file) for file in files)
 
 
 def read_each(

@@ -172,6 +172,8 @@ def test_library_import(tmp_path: Path) -> None:
     (tmp_path / "02_01.bvh").write_text(cmu_bvh(walk()))
     (tmp_path / "bad.bvh").write_text("HIERARCHY")
     out = tmp_path / "out" / "clips.npz"
+    early = invoke("library", "import", tmp_path, "--out", out)
+    assert (early.exit_code, "there is no folder" in early.stderr) == (2, True)
     out.parent.mkdir()
     done = run("library", "import", tmp_path, "--out", out)
     assert done.returncode == 0, done.stderr

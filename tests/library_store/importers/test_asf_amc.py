@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 
 from library_store.anatomy import LENGTHS, measure_lengths
 from library_store.importers import MocapError, read
-from library_store.importers.asf_amc import bone_ends, read_asf
+from library_store.importers.asf_amc import bone_ends, find_skeleton, read_asf
 from tests.library_store.importers.files import ASF, amc, walk
 
 MM = 25.4 / 0.45
@@ -174,4 +174,25 @@ def test_a_skeleton_without_a_bone_is_refused(clip_file: Path) -> None:
             read(clip_file)
     asf.unlink()
     with pytest.raises(MocapError, match=r"ASF skeleton.*found: none"):
+        read(clip_file)
+
+
+def test_a_skeleton_is_that_of_its_own_subject(clip_file: Path) -> None:
+    """All of CMU's files in one folder: 10.asf is not the skeleton of 105_01.amc."""
+    folder, text = clip_file.parent, clip_file.read_text()
+    (folder / "10.asf").write_text(ASF)
+    for stem in ("10", "10_01", "10-dance"):
+        assert find_skeleton(folder / f"{stem}.amc") == folder / "10.asf"
+    (folder / "105_01.amc").write_text(text)
+    with pytest.raises(MocapError, match=r"105_01\.amc: its ASF .* found: 02\.asf, 10\.asf"):
+        read(folder / "105_01.amc")
+
+
+def test_what_is_wrong_is_said_in_words(clip_file: Path) -> None:
+    text, asf = clip_file.read_text(), clip_file.with_name("02.asf")
+    clip_file.write_text(text.replace("ltibia", "lshin"))
+    with pytest.raises(MocapError, match=r"line \d+: 'lshin .*': its skeleton has no such bone"):
+        read(clip_file)
+    asf.write_text(ASF[: ASF.index(":hierarchy")])
+    with pytest.raises(MocapError, match="not a whole ASF skeleton: it has no 'hierarchy'"):
         read(clip_file)

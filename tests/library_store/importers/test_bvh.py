@@ -110,6 +110,9 @@ def test_forward_kinematics_by_hand(tmp_path: Path) -> None:
         ("Zrotation Xrotation Y", "Zrotation Xrotation Q", "unknown channels"),
         ("OFFSET 1 0 0", "OFFSET 1 0", "not a whole BVH"),
         ("0.04", "0", "frame time"),
+        ("0.04", "0,04", "float: '0,04'"),
+        ("\n}\nMOTION", "\nMOTION", "the hierarchy does not end"),
+        ("\nMOTION", "\n}\nMOTION", "braces do not match"),
     ],
 )
 def test_malformed_files_are_refused(tmp_path: Path, old: str, new: str, problem: str) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from library_store.errors import LibraryError
-from library_store.importers import Clip, MocapError, read, read_all
+from library_store.importers import Clip, MocapError, find_files, read, read_all
 from tests.library_store.importers.files import ASF, amc, cmu_bvh, walk
 
 
@@ -44,6 +44,21 @@ def test_files_of_other_kinds_and_missing_ones(folder: Path) -> None:
         read(folder / "notes.txt")
     with pytest.raises(MocapError, match="cannot be read: No such file"):
         read(folder / "nothing.bvh")
+
+
+def test_an_archive_is_to_be_unpacked(tmp_path: Path) -> None:
+    with pytest.raises(MocapError, match=r"clips\.zip: not a kind of file .*; unpack it first"):
+        read(tmp_path / "clips.zip")
+
+
+def test_links_to_folders_are_followed_and_rings_end(folder: Path, tmp_path: Path) -> None:
+    top = tmp_path / "top"
+    (top / "walk.bvh").mkdir(parents=True)  # a folder, whatever it is called
+    (top / "walk.bvh" / "inner.bvh").write_text(cmu_bvh(walk()))
+    (top / "linked").symlink_to(folder / "02")
+    (top / "walk.bvh" / "ring").symlink_to(top)
+    names = [path.relative_to(top).as_posix() for path in find_files([top])]
+    assert names == ["linked/02_01.amc", "linked/02_02.amc", "walk.bvh/inner.bvh"]
 
 
 @pytest.mark.parametrize(
