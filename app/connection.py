@@ -5,7 +5,8 @@ a head that does not arrive               408 after ``patience_s``, closed witho
                                           if not a byte of it came
 a head that does not end                  431 after ``MAX_HEAD_BYTES``
 bytes that are no HTTP                    400
-the rest of a body refused unread         read and dropped for ``patience_s``, then closed
+the rest of a body refused unread         read and dropped for ``patience_s``, then closed; so it
+                                          is where the connection ends with the answer
 an answer that the client does not take   closed after ``patience_s``
 ========================================= ==================================================
 
@@ -57,7 +58,8 @@ class Connection(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start waiting for the first head."""
         plain = transport.get_extra_info("sslcontext") is None
-        super().connection_made(_Sender(transport, self.loop) if plain else transport)
+        sender = _Sender(transport, self.loop, self._awaits_rest) if plain else transport
+        super().connection_made(sender)
         self._timers: dict[str, asyncio.TimerHandle] = {}
         self._running: RequestResponseCycle | None = None
         self._head_bytes = 0
@@ -78,8 +80,9 @@ class Connection(HttpToolsProtocol):
             end = len(data) if end < 0 else end
             if _UPGRADE.search(data, 0, end):
                 data = _UPGRADE.sub(b"X-Grade", data[:end]) + data[end:]
+        head = self._timers.get("head")
         super().data_received(data)
-        if "head" in self._timers:
+        if head is not None and head is self._timers.get("head"):  # what began here counts anew
             self._head_bytes += len(data)
             if self._head_bytes > MAX_HEAD_BYTES:
                 self._end(431, "head-too-large", f"the head is larger than {MAX_HEAD_BYTES} bytes")
@@ -87,6 +90,7 @@ class Connection(HttpToolsProtocol):
     def on_message_begin(self) -> None:
         """A head begins; the parser calls this."""
         super().on_message_begin()
+        self._unset_keepalive_if_required()
         self._head_bytes = 0
         why = f"the head of the request was not complete after {self.patience_s:g} s"
         self._expect("head", lambda: self._end(408, "upload-too-slow", why))
@@ -102,12 +106,27 @@ class Connection(HttpToolsProtocol):
         self._arrived("rest")
         self._in_body = False
         super().on_message_complete()
+        self.cycle.more_body = False
+        if self.transport.is_closing():
+            self.transport.close()
+        elif self.cycle.response_complete:
+            # uvicorn has forgotten it with the first piece that came after the answer.
+            self.timeout_keep_alive_task = self.loop.call_later(
+                self.timeout_keep_alive, self.timeout_keep_alive_handler
+            )
 
     def on_response_complete(self) -> None:
         """The answer is written, perhaps before its request was read to the end."""
+        answered = self._running
         super().on_response_complete()
-        if self.cycle.more_body and not self.transport.is_closing():
+        if answered is not None and answered.more_body and not self.transport.is_closing():
             self._expect("rest", self._give_up)
+
+    def shutdown(self) -> None:
+        """The service ends, and waits for answers only."""
+        super().shutdown()
+        if self.transport.is_closing():
+            self.transport.close()
 
     def pause_writing(self) -> None:
         """The client does not read as fast as it is answered."""
@@ -135,6 +154,7 @@ class Connection(HttpToolsProtocol):
     def _end(self, status: int, slug: str, detail: str) -> None:
         """Answer with a problem and close, unless another answer is due or has begun."""
         if self.transport.is_closing():
+            self.transport.close()
             return
         cycle = self.cycle
         begun = cycle is not None and cycle.response_started and not cycle.response_complete
@@ -156,16 +176,32 @@ class Connection(HttpToolsProtocol):
     def _start_asgi_task(self, cycle: RequestResponseCycle, app: ASGI3Application) -> None:
         self._running = cycle
         # With others queued behind it one after the other would be answered from within the last.
-        if cycle.keep_alive and not self.pipeline and not self.flow.write_paused:
+        if not self.pipeline and not self.flow.write_paused:
             answer = type(self).early_answer(cast(Scope, cycle.scope))
             if answer is not None:
-                self.transport.write(answer)
-                if isinstance(self.transport, _Sender):
-                    self.transport.flush()
-                cycle.response_started = cycle.response_complete = True
-                cycle.on_response()
+                self._answer_early(cycle, answer)
                 return
         super()._start_asgi_task(cycle, app)
+
+    def _answer_early(self, cycle: RequestResponseCycle, answer: bytes) -> None:
+        if not cycle.keep_alive:
+            answer = answer.replace(b"\r\n\r\n", b"\r\nconnection: close\r\n\r\n", 1)
+        self.transport.write(answer)
+        if isinstance(self.transport, _Sender):
+            self.transport.flush()
+        cycle.response_started = cycle.response_complete = True
+        if not cycle.keep_alive:
+            self.transport.close()
+        cycle.on_response()
+
+    def _awaits_rest(self) -> bool:
+        """Wait for the rest of a body that is answered already; whether there is any to come."""
+        cycle = self._running
+        if cycle is None or not (cycle.response_complete and cycle.more_body):
+            return False
+        self._expect("rest", self._give_up)
+        self.flow.resume_reading()
+        return True
 
     def _disconnect(self) -> None:
         """Tell the requests there are that their answers have nowhere to go.
@@ -186,12 +222,22 @@ class _Sender(asyncio.Transport):
     well include the receiver's turn.
     """
 
-    def __init__(self, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(
+        self,
+        transport: asyncio.Transport,
+        loop: asyncio.AbstractEventLoop,
+        awaits_rest: Callable[[], bool],
+    ) -> None:
+        """``awaits_rest`` is asked before closing: if so, ``close`` will be called once more."""
         super().__init__()
         self._transport = transport
         self._loop = loop
+        self._awaits_rest = awaits_rest
+        self._half_closed = False
         self._socket: int = transport.get_extra_info("socket").fileno()
         self._written: list[bytes] = []
+        # Whatever is left to it is what the client does not take: the protocol has to know.
+        transport.set_write_buffer_limits(high=0)
 
     def write(self, data: bytes | bytearray | memoryview[Any]) -> None:
         """Send ``data`` before the loop's next turn."""
@@ -200,9 +246,17 @@ class _Sender(asyncio.Transport):
         self._written.append(bytes(data))
 
     def close(self) -> None:
-        """Send what is written, then close."""
+        """Send what is written, then close: at first one side, while the client is still sending.
+
+        A socket closed with something unread, or still to come, resets the connection: the client
+        would fail amidst its upload and might never see that it is answered.
+        """
         self.flush()
-        self._transport.close()
+        if self.is_closing() or not self._awaits_rest():
+            self._transport.close()
+        else:
+            self._half_closed = True
+            self._transport.write_eof()
 
     def abort(self) -> None:
         """Close at once."""
@@ -211,7 +265,7 @@ class _Sender(asyncio.Transport):
 
     def is_closing(self) -> bool:
         """Whether the connection is closed or about to be."""
-        return self._transport.is_closing()
+        return self._half_closed or self._transport.is_closing()
 
     def pause_reading(self) -> None:
         """Receive no more for now."""
@@ -229,7 +283,7 @@ class _Sender(asyncio.Transport):
         """Send what is written now."""
         data = b"".join(self._written)
         self._written.clear()
-        if not data or self._transport.is_closing():
+        if not data or self.is_closing():
             return
         sent = 0
         if not self._transport.get_write_buffer_size():
