@@ -291,6 +291,8 @@ def sample(
     chosen = next((known for known in kinds if known == kind), None)
     if kind and chosen is None:
         raise typer.BadParameter(", ".join(kinds), param_hint="--kind")
+    if not cv2.haveImageWriter(str(out)):
+        raise typer.BadParameter(f"{out} is no picture: .png, .jpg", param_hint="--out")
     directory = library or build_if_missing(load_settings())
     opened = load(directory, verify=False, backend="exact")
     entries = draw_entries(opened, count, chosen, seed)
