@@ -117,7 +117,9 @@ def export(
     version: Annotated[str, typer.Option(help="Of the weights; users see it in every answer.")],
     kind: Annotated[str, typer.Option(help="cpm or person.")] = "cpm",
     name: Annotated[str | None, typer.Option(help="Of the card; default the kind.")] = None,
-    input_px: Annotated[int | None, typer.Option(min=32, help="Default as trained.")] = None,
+    input_px: Annotated[
+        int | None, typer.Option(min=32, help="A multiple of 32; default as trained.")
+    ] = None,
 ) -> None:
     """Make a training run's checkpoint into an ONNX file and its card.
 

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from library_store.skeleton import LSP14
 from models.card import WEIGHTS_DIR, DetectorOutput, ModelCard, PoseOutput, write_card
+from models.errors import ModelError
 from models.training.augment import CROP_SCALE
 from models.training.network import (
     BACKGROUND,
@@ -32,6 +33,8 @@ from models.training.onnx_graph import HALF, PREFIX, person_model, pose_model
 from models.training.train_people import UNIT_PX
 
 Kind = Literal["cpm", "person"]
+COARSEST_STRIDE_PX = 32
+"""Of both networks' pyramids."""
 DETECTOR_THRESHOLD = 0.35
 PHOTO_PX = 320
 """Default for the longer side of the photo that the person network sees."""
@@ -57,8 +60,11 @@ def multiply_adds(network: nn.Module, image: Tensor) -> int:
         total += out.shape[-1] * out.shape[-2] * module.weight.numel()
 
     hooks = [m.register_forward_hook(count) for m in network.modules() if isinstance(m, nn.Conv2d)]
+    was_training = network.training
+    network.eval()  # while training, a pass would move the statistics of the batch norms
     with torch.no_grad():
         network(image)
+    network.train(was_training)
     for hook in hooks:
         hook.remove()
     return total
@@ -162,6 +168,17 @@ def publish(model: onnx.ModelProto, card: ModelCard, directory: Path) -> ModelCa
     return card
 
 
+def _read_checkpoint(path: Path) -> dict[str, Any]:
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a reader of foreign bytes fails in every way
+        raise ModelError(f"{path} cannot be read as a training run's last.pt: {error}") from error
+    missing = {"config", "ema", "step"} - (state.keys() if isinstance(state, dict) else set())
+    if missing:
+        raise ModelError(f"{path} is not a training run's last.pt: no {', '.join(sorted(missing))}")
+    return dict(state)
+
+
 def export(
     checkpoint: Path,
     directory: Path,
@@ -174,20 +191,26 @@ def export(
     """Write the averaged weights of a training run's checkpoint as ONNX and card.
 
     ``size_px`` is the crop's side (default: that of the run's last step) or the photo's longer
-    side (default: 320).
+    side (default: 320); both are multiples of 32. Raises ``ModelError`` for another size and for a
+    file that is no such checkpoint.
     """
-    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    config = {**state["config"], "blocks": tuple(state["config"]["blocks"])}
-    if kind == "cpm":
-        cpm = ConvolutionalPoseMachine(CpmConfig(**config))
-        cpm.load_state_dict(state["ema"])
-        size = size_px or int(state["size_px"])
-        card, model = pose_card(cpm, name or kind, version, size), pose_model(cpm, size)
-    else:
-        person = PersonNetwork(PersonConfig(**config))
-        person.load_state_dict(state["ema"])
-        size = size_px or PHOTO_PX
-        card, model = person_card(person, name or kind, version, size), person_model(person)
+    if size_px is not None and size_px % COARSEST_STRIDE_PX:
+        raise ModelError(f"an input of {size_px} px: a multiple of {COARSEST_STRIDE_PX} is wanted")
+    state = _read_checkpoint(checkpoint)
+    try:
+        config = {**state["config"], "blocks": tuple(state["config"]["blocks"])}
+        if kind == "cpm":
+            cpm = ConvolutionalPoseMachine(CpmConfig(**config))
+            cpm.load_state_dict(state["ema"])
+            size = size_px or int(state["size_px"])
+            card, model = pose_card(cpm, name or kind, version, size), pose_model(cpm, size)
+        else:
+            person = PersonNetwork(PersonConfig(**config))
+            person.load_state_dict(state["ema"])
+            size = size_px or PHOTO_PX
+            card, model = person_card(person, name or kind, version, size), person_model(person)
+    except (KeyError, TypeError, RuntimeError) as error:
+        raise ModelError(f"{checkpoint} is of no {kind} network: {error}") from error
     card = card.model_copy(update={"measured": {"training_steps": float(state["step"])}})
     return publish(model, card, directory)
 

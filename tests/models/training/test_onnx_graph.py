@@ -10,7 +10,15 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
-from models.training.export import person_card, pose_card, publish, read_weights  # noqa: E402
+from models.errors import ModelError  # noqa: E402
+from models.session import OnnxModel  # noqa: E402
+from models.training.export import (  # noqa: E402
+    export,
+    person_card,
+    pose_card,
+    publish,
+    read_weights,
+)
 from models.training.network import (  # noqa: E402
     ConvolutionalPoseMachine,
     CpmConfig,
@@ -79,3 +87,27 @@ def test_training_goes_on_from_an_exported_file(tmp_path: Path) -> None:
 def test_the_same_weights_give_the_same_bytes() -> None:
     network = shaken(ConvolutionalPoseMachine(CPM))
     assert pose_model(network, 64) == pose_model(network, 64)
+
+
+def test_a_checkpoint_becomes_files_that_are_served(tmp_path: Path) -> None:
+    network = shaken(ConvolutionalPoseMachine(CPM))
+    checkpoint = tmp_path / "last.pt"
+    state = {"config": CPM.as_dict(), "ema": network.state_dict(), "step": 7, "size_px": 96}
+    torch.save(state, checkpoint)
+    card = export(checkpoint, tmp_path / "out", "cpm", version="1", size_px=64)
+    images = np.random.default_rng(0).integers(0, 256, (1, 64, 64, 3), dtype=np.uint8)
+    found, expected = outputs(tmp_path / "out" / card.file, network, images)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
+    assert OnnxModel(tmp_path / "out", card.name).card == card
+    assert card.measured == {"training_steps": 7.0}
+    with pytest.raises(ModelError, match="multiple of 32"):
+        export(checkpoint, tmp_path / "out", "cpm", version="1", size_px=80)
+    with pytest.raises(ModelError, match=r"last\.pt is of no person network"):
+        export(checkpoint, tmp_path / "out", "person", version="1")
+    torch.save({"ema": {}, "step": 1}, checkpoint)
+    with pytest.raises(ModelError, match="no config"):
+        export(checkpoint, tmp_path / "out", "cpm", version="1")
+    checkpoint.write_bytes(b"no checkpoint")
+    with pytest.raises(ModelError, match="cannot be read"):
+        export(checkpoint, tmp_path / "out", "cpm", version="1")
+    assert sorted(it.name for it in (tmp_path / "out").iterdir()) == ["cpm.json", "cpm.onnx"]
