@@ -29,7 +29,7 @@ import numpy as np
 from app.lifting.ensemble import Ensemble, LocalPrior, local_prior
 from app.lifting.evidence import Evidence
 from app.lifting.geometry import Floats, lift_to_depth
-from app.lifting.learned import misplaced, with_learned
+from app.lifting.learned import apart_mm, misplaced, with_learned
 from app.lifting.posterior import STANDARD_PX_PER_MM
 from app.lifting.proportions import asymmetry
 from app.lifting.stature import expected_stature_mm
@@ -56,17 +56,19 @@ class FusionSettings:
     Chosen on mocap subjects of whom no table is measured (and who were not in that trial's
     library), except those that came later: ``bandwidth_px``, ``localisation_bones``,
     ``proportion_spread``, ``asymmetry`` and ``outlier_prior`` on some of the even-numbered people
-    of the tables' sets, ``ambiguous_mm`` on every fifth of the first; and the doubts, which frames
-    of the network's own subjects hardly tell apart, on every tenth of both.
+    of the tables' sets, ``ambiguous_mm`` on every fifth of the first and ``disagreement`` on every
+    fourth; and the doubts, which frames of the network's own subjects hardly tell apart, on every
+    tenth of both.
 
     ``bandwidth_px``, ``adaptive``, ``granularity_px``, ``localisation_bones``: see
     ``ensemble.local_prior``; ``proportion_spread``: see ``ensemble.place_ensemble``;
     ``doubt_of_noisy``, ``doubt_of_exact``, ``doubt_px``: see :meth:`doubt`;
-    ``asymmetry``: standard deviation of the log ratio of two sides' lengths; ``noise_px``: the
-    noise levels ν that are weighed by evidence; ``outlier_prior``: probability that a joint of
-    full confidence is elsewhere. Depth is ambiguous if a limb's far end is within
-    ``ambiguous_sigmas`` of being as deep as its near end and the standard deviation of that
-    difference is above ``ambiguous_mm``.
+    ``asymmetry``: standard deviation of the log ratio of two sides' lengths; ``disagreement``: the
+    share of a joint's distance from the neighbours' to the network's that counts as spread of its
+    own; ``noise_px``: the noise levels ν that are weighed by evidence; ``outlier_prior``:
+    probability that a joint of full confidence is elsewhere. Depth is ambiguous if a limb's far
+    end is within ``ambiguous_sigmas`` of being as deep as its near end and the standard deviation
+    of that difference is above ``ambiguous_mm``.
     """
 
     bandwidth_px: float = 16.0
@@ -78,6 +80,7 @@ class FusionSettings:
     doubt_of_exact: float = 6.0
     doubt_px: float = 2.0
     asymmetry: float = 0.15
+    disagreement: float = 0.55
     noise_px: tuple[float, ...] = (1.0, 2.0, 3.0, 4.5, 6.5, 9.0, 13.0)
     outlier_prior: float = 0.06
     ambiguous_mm: float = 85.0
@@ -99,9 +102,10 @@ class FusedPose:
     """The answer of :func:`fuse`.
 
     ``joints_mm`` (J, 3) in the centred view's camera frame; ``spread_mm`` (J,) posterior standard
-    deviation of a joint about the root, all axes together, not calibrated; ``noise_px`` the noise
-    found, standard pixels; ``outlier`` the joint that contradicts the others, or None;
-    ``ambiguous``: some limb may as well point towards the camera as away from it.
+    deviation of a joint about the root, all axes together, with what neighbours and network
+    disagree by, not calibrated; ``noise_px`` the noise found, standard pixels; ``outlier`` the
+    joint that contradicts the others, or None; ``ambiguous``: some limb may as well point towards
+    the camera as away from it.
     """
 
     joints_mm: Floats
@@ -156,6 +160,7 @@ def fuse(
         prior.covariance - pulled @ gain.T,
         prior.root_depth_mm,
     )
+    of_neighbours = posterior
     if learned is not None:
         doubt = settings.doubt(evidence.mean_noise_var)
         posterior = with_learned(posterior, learned, ensemble.px_per_unit, doubt)
@@ -163,11 +168,15 @@ def fuse(
     posterior = _made_as_tall(posterior, ensemble.px_per_unit, ensemble.stature_mm)
     suspect = evidence.suspect(confidence[seen], settings.outlier_prior)
     outlier = None if suspect is None else int(seen[suspect])
+    spread = _spread_about_root(posterior)
     if learned is not None:
+        # Both saw the same joints: how far they differ tells how far either may be wrong.
+        apart = apart_mm(of_neighbours, learned, ensemble.px_per_unit, posterior.root_depth_mm)
+        spread = np.hypot(spread, settings.disagreement * apart)
         outlier = misplaced(learned, points, confidence, ensemble.px_per_unit, outlier)
     return FusedPose(
         joints_mm=_joints(posterior, ensemble.px_per_unit),
-        spread_mm=_spread_about_root(posterior),
+        spread_mm=spread,
         noise_px=float(np.sqrt(evidence.mean_noise_var)),
         outlier=outlier,
         ambiguous=_is_ambiguous(posterior, settings),

@@ -19,7 +19,8 @@ import numpy as np
 
 from app.lifting.ensemble import LocalPrior
 from app.lifting.geometry import Floats
-from library_store.skeleton import LSP14
+from app.lifting.posterior import STANDARD_PX_PER_MM
+from library_store.skeleton import L_HIP, LSP14, R_HIP
 from models.pose_lifter import LearnedPose
 
 _SETTLED_PX = 0.1
@@ -87,3 +88,23 @@ def with_learned(
         pose.covariance - gain @ pose.covariance + misjudged,
         pose.root_depth_mm,
     )
+
+
+def apart_mm(
+    pose: LocalPrior, learned: LearnedPose, px_per_unit: float, root_depth_mm: float
+) -> Floats:
+    """How far from each other ``pose`` and the network put each joint (J,).
+
+    Args:
+        pose: a Gaussian over states that has not seen the network's answer.
+        learned: that answer in the same view.
+        px_per_unit: standard pixels in a normalised unit.
+        root_depth_mm: at which a difference of depths about the root counts.
+
+    """
+    n = LSP14.n_joints
+    across_px = px_per_unit * learned.points - pose.mean[: 2 * n].reshape(n, 2)
+    along = learned.depths - pose.mean[2 * n :]
+    along_mm = root_depth_mm * (along - 0.5 * (along[R_HIP] + along[L_HIP]))
+    distance: Floats = np.sqrt((across_px**2).sum(1) / STANDARD_PX_PER_MM**2 + along_mm**2)
+    return distance

@@ -7,7 +7,7 @@ import pytest
 
 from app.lifting.ensemble import LocalPrior
 from app.lifting.fusion import FusionSettings
-from app.lifting.learned import misplaced, with_learned
+from app.lifting.learned import apart_mm, misplaced, with_learned
 from app.lifting.lifter import Lifter, LiftingSettings
 from evaluation.metrics import rigid_error_mm
 from library_store.library import Library
@@ -66,6 +66,42 @@ def test_weights_that_are_not_the_best_leave_more_uncertainty() -> None:
         assert np.linalg.eigvalsh(left[doubt] - left[2.0]).min() > -1e-9
         assert np.trace(left[doubt]) > 1.05 * np.trace(left[2.0])
     assert np.linalg.eigvalsh(left[2.0]).min() > -1e-9
+
+
+def test_what_it_disagrees_by_is_counted_in_mm_about_the_root() -> None:
+    mean, covariance = gaussian(1, 10.0)
+    pose = LocalPrior(mean, covariance, 4000.0)
+    points, depths = mean[:28].reshape(14, 2) / PX_PER_UNIT, mean[28:]
+
+    def apart(points: np.ndarray, depths: np.ndarray) -> np.ndarray:
+        return apart_mm(pose, LearnedPose(points, depths, covariance), PX_PER_UNIT, 4000.0)
+
+    np.testing.assert_allclose(apart(points, depths), 0.0, atol=1e-9)
+    np.testing.assert_allclose(apart(points, depths + 0.1), 0.0, atol=1e-9)
+    moved, nearer = points.copy(), depths.copy()
+    moved[4] += [3.0 / PX_PER_UNIT, 4.0 / PX_PER_UNIT]
+    nearer[7] -= 0.01
+    wanted = np.zeros(14)
+    wanted[4], wanted[7] = 5.0 / 0.25, 40.0
+    np.testing.assert_allclose(apart(moved, nearer), wanted, atol=1e-9)
+
+
+def test_whom_the_two_disagree_about_is_less_sure_and_not_answered_otherwise(
+    library: Library, people: People
+) -> None:
+    settings = LiftingSettings()
+    without = LiftingSettings(fusion=replace(settings.fusion, disagreement=0.0))
+    network = PoseLifter()
+    told, untold = Lifter(library, settings, network), Lifter(library, without, network)
+    added = []
+    for index in range(10):
+        here, there = (lift_one(one, people.observation(index)) for one in (told, untold))
+        np.testing.assert_array_equal(here.joints_3d_mm, there.joints_3d_mm)
+        assert here.sigma_mm is not None
+        assert there.sigma_mm is not None
+        assert (here.sigma_mm >= there.sigma_mm).all()
+        added.append((here.sigma_mm / there.sigma_mm).mean())
+    assert np.ptp(added) > 0.01
 
 
 def test_it_helps(lifter: Lifter, both: Lifter, people: People) -> None:
