@@ -150,7 +150,8 @@ def read_card(path: Path) -> ModelCard:
 
 def write_card(path: Path, card: ModelCard) -> None:
     """Write a card as people read it, checked once more."""
-    path.write_text(ModelCard.model_validate(card.model_dump()).model_dump_json(indent=2) + "\n")
+    text = ModelCard.model_validate(card.model_dump()).model_dump_json(indent=2) + "\n"
+    path.write_text(text, encoding="utf-8")
 
 
 def read_weights(path: Path, card: ModelCard) -> bytes:
