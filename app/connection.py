@@ -109,7 +109,7 @@ class Connection(HttpToolsProtocol):
         self.cycle.more_body = False
         if self.transport.is_closing():
             self.transport.close()
-        elif self.cycle.response_complete:
+        elif self.cycle.response_complete and self.timeout_keep_alive_task is None:
             # uvicorn has forgotten it with the first piece that came after the answer.
             self.timeout_keep_alive_task = self.loop.call_later(
                 self.timeout_keep_alive, self.timeout_keep_alive_handler
