@@ -28,7 +28,7 @@ from evaluation.paper.published import ACTIONS, HUMANEVA_ACTIONS
 from evaluation.paper.views import Scene, SceneCamera, virtual_cameras
 from library_store.importers.clip import Clip, MocapError
 from library_store.importers.h36m import CAMERAS, METADATA, N_SUBJECTS, camera_rotation
-from library_store.importers.reader import read
+from library_store.importers.reader import read_all
 from library_store.importers.rotation import up_to_y
 
 H36M_NPZ, HUMANEVA_NPZ = "data_3d_h36m.npz", "data_3d_humaneva*.npz"
@@ -196,13 +196,9 @@ def _h36m_clips(root: Path, found: Found) -> list[Clip]:
 
 
 def _read(files: Sequence[Path], found: Found) -> list[Clip]:
-    """The clips of all files; those that cannot be read are said to be missing."""
-    clips: list[Clip] = []
-    for file in files:
-        try:
-            clips += read(file)
-        except MocapError as error:
-            found.missing.append(str(error))
+    """The clips of all files; files and clips that cannot be read are said to be missing."""
+    clips, skipped = read_all(files)
+    found.missing += map(str, skipped)
     return clips
 
 

@@ -80,6 +80,20 @@ def test_an_empty_folder_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "Human3.6M: no data_3d_h36m.npz" in capsys.readouterr().out
 
 
+def test_a_clip_beyond_use_costs_only_itself(tmp_path: Path) -> None:
+    path = tmp_path / "data_3d_humaneva15.npz"
+    humaneva_npz(path)
+    whole = find_humaneva(tmp_path)
+    with np.load(path, allow_pickle=True) as packed:
+        held = packed["positions_3d"].item()
+    held["Validate/S1"]["Jog 1 chunk0"][:] = np.nan
+    np.savez(path, positions_3d=np.array(held, dtype=object))
+    found = find_humaneva(tmp_path)
+    assert len(found.scenes) == len(whole.scenes) - 1
+    (missing,) = found.missing
+    assert "clip 'Validate_S1_Jog_1_chunk0' has no frame" in missing
+
+
 def test_tables_of_free_mocap(tmp_path: Path) -> None:
     clips = []
     for subject, action in (("cmu_01", "climb"), ("cmu_02", "walk"), ("cmu_35", "run/jog")):
