@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -134,6 +135,17 @@ def test_glitches_are_dropped(standing: Float) -> None:
     mixed[1::4, L_ELBOW] += 900.0
     with pytest.raises(MocapError, match="no one skeleton"):
         checked(FILE, clip_of(mixed))
+
+
+def test_numbers_of_every_nth_frame_make_nothing_slower(standing: Float) -> None:
+    """The rate is that of the poses: a jump is one, however its frames are numbered."""
+    poses = standing.copy()
+    poses[9, [L_ELBOW, L_WRIST]] = 2.0 * poses[9, L_ELBOW - 1] - poses[9, [L_ELBOW, L_WRIST]]
+    numbered = [
+        replace(clip_of(poses, rate_hz=120.0), frames=n * np.arange(len(poses))) for n in (1, 40)
+    ]
+    for clip in numbered:
+        assert len(checked(FILE, clip)) == len(poses) - 1
 
 
 def test_a_throw_is_no_glitch(standing: Float) -> None:
