@@ -52,7 +52,7 @@ def clean(file: Path, *, rate_hz: float, licence: str) -> Iterator[CleanClip]:
                 f"does not say under which licence clip {clip.name!r} may be used; "
                 "give it with --licence",
             )
-        thinned = in_order(clip.thinned(rate_hz))
+        thinned = in_order(clip).thinned(rate_hz)
         ready = face_ahead(thinned.positions_mm.astype(np.float64))
         yield CleanClip(
             name=clip.name,

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +63,13 @@ def test_clips_are_thinned_ordered_and_licensed(tmp_path: Path) -> None:
     assert (first.name, first.subject, first.licence) == ("a", "person 1", "free for all uses")
     assert first.frames.tolist() == list(range(0, 120, 6))
     assert first.poses.shape == (20, 14, 3)
+    original = clip("a", 60, 1)
+    backwards = replace(
+        original, positions_mm=original.positions_mm[::-1], frames=original.frames[::-1]
+    )
+    (same,) = clean(write_clips(tmp_path / "b.npz", backwards), rate_hz=10.0, licence="")
+    assert same.frames.tolist() == first.frames.tolist()
+    assert_allclose(same.poses, first.poses, atol=1e-3)
     mixed = in_order(
         type(shuffled)(
             name="b",
