@@ -150,7 +150,7 @@ def person_card(network: PersonNetwork, name: str, version: str, size: int) -> M
         training_data=[LABELLED, PHOTOS, RENDERED, SCENES],
         licence="Apache-2.0 (weights); the training images keep their own terms",
         limits=[
-            "people smaller than a tenth of the photo's longer side are often missed",
+            "people smaller than a fifteenth of the photo's longer side are often missed",
             "boxes are of the joints, not of hair, clothes or things held",
             RESEARCH,
         ],

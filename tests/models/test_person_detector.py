@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from models.card import DetectorOutput
 from models.person_detector import PersonDetector, decode, iou, shrunk
 
 PHOTO = Path(__file__).parents[1] / "data" / "renders" / "014.jpg"
@@ -55,14 +56,16 @@ def test_boxes_are_in_the_pixels_of_the_photo_given() -> None:
     """A photo of every pixel four times is the same photo: pixel x becomes 2 x and 2 x + 1."""
     photo = cv2.imread(str(PHOTO))
     assert photo is not None
-    scale = 320 / max(photo.shape[:2])
+    detector = PersonDetector(provider="cpu")
+    assert isinstance(detector.card.output, DetectorOutput)
+    side = detector.card.output.long_side_px
+    scale = side / max(photo.shape[:2])
     small = np.asarray(cv2.resize(photo, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
-    assert max(small.shape[:2]) == 320
+    assert max(small.shape[:2]) == side
     framed = np.zeros(small.shape, np.uint8)  # away from the edge, where boxes end
     half = cv2.resize(small, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     top, left = (np.array(small.shape[:2]) - half.shape[:2]) // 2
     framed[top : top + half.shape[0], left : left + half.shape[1]] = half
-    detector = PersonDetector(provider="cpu")
     (box,) = detector.detect(framed, 1, threshold=0.05)
     (other,) = detector.detect(framed.repeat(2, axis=0).repeat(2, axis=1), 1, threshold=0.05)
     first = np.array([box.x_px, box.y_px])
