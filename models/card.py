@@ -45,14 +45,14 @@ class PoseOutput(_Frozen):
     target_sigma_cells: float = Field(description="blur of the training targets")
     maps: Literal["logits", "beliefs"]
     border_grey: int = Field(0, ge=0, le=255, description="what crops have beyond the photo's edge")
-    looks: Literal[1, 2] = Field(1, description="2: a second, mirrored and upright look per crop")
+    looks: Literal[1, 2, 3] = Field(1, description="how often a doubtful crop is looked at")
     confidence: ConfidenceCalibration | None = None
     spread: SpreadCalibration | None = None
 
     @model_validator(mode="after")
-    def _two_looks_add_logits(self) -> Self:
-        if self.looks == 2 and self.maps != "logits":
-            raise ValueError("two looks are averaged as logits: looks 2 needs maps logits")
+    def _looks_add_logits(self) -> Self:
+        if self.looks > 1 and self.maps != "logits":
+            raise ValueError(f"looks are averaged as logits: looks {self.looks} needs maps logits")
         return self
 
     @property

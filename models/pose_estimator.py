@@ -15,7 +15,7 @@ from models.errors import ModelError
 from models.heatmaps import Floats, Joints2D, calibrated, read_maps
 from models.person_detector import PersonBox
 from models.providers import ProviderChoice, Runtime
-from models.second_look import looked_at
+from models.looks import looked_at
 from models.session import OnnxModel
 
 

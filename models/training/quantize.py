@@ -210,8 +210,8 @@ def quantize(directory: Path, name: str, images: Images) -> ModelCard:
     card = read_card(directory / f"{name}.json")
     output = card.output
     if isinstance(output, PoseOutput):
-        # What 8 bits save buys a second look, which is worth more than they cost.
-        output = output.model_copy(update={"looks": 2, "confidence": None, "spread": None})
+        # What 8 bits save buys further looks, which are worth more than they cost.
+        output = output.model_copy(update={"looks": 3, "confidence": None, "spread": None})
     twin = card.model_copy(
         update={
             "output": output,

@@ -8,7 +8,7 @@ from library_store.skeleton import L_HIP, L_SHOULDER, LSP14, R_HIP, R_SHOULDER
 from models.card import WEIGHTS_DIR, read_card
 from models.errors import ModelError
 from models.heatmaps import sub_cell_peaks
-from models.second_look import leans, looked_at, mirrored_upright
+from models.looks import FURTHER, Look, leans, looked_at, upright
 
 CELLS, SIZE = 40, 160
 STRIDE = SIZE // CELLS
@@ -41,22 +41,24 @@ def test_the_lean_is_read_off_the_maps(angle_deg: float) -> None:
     assert abs((found - angle_deg + 180) % 360 - 180) < 5
 
 
+@pytest.mark.parametrize("look", FURTHER)
 @pytest.mark.parametrize("angle_deg", [0, 30, -75, 140, 180])
-def test_the_second_view_is_upright_and_mirrored(angle_deg: float) -> None:
+def test_further_views_are_upright(look: Look, angle_deg: float) -> None:
     joints = leaning(angle_deg)
-    matrix = mirrored_upright(np.deg2rad(angle_deg), CELLS)
+    matrix = upright(look, np.deg2rad(angle_deg), CELLS)
     seen = joints @ matrix[:, :2].T + matrix[:, 2]
     trunk = seen[[R_SHOULDER, L_SHOULDER]].mean(0) - seen[[R_HIP, L_HIP]].mean(0)
     assert abs(trunk[0]) < 1e-9
     assert trunk[1] < 0
-    assert np.linalg.det(matrix[:, :2]) == pytest.approx(-1)
+    assert np.linalg.det(matrix[:, :2]) == pytest.approx(look.zoom**2 * (-1) ** look.mirrored)
     back = (seen - matrix[:, 2]) @ np.linalg.inv(matrix[:, :2]).T
     np.testing.assert_allclose(back, joints)
 
 
+@pytest.mark.parametrize("looks", [2, 3])
 @pytest.mark.parametrize("angle_deg", [0, 30, -75, 140, 180])
-def test_two_looks_that_agree_change_nothing(angle_deg: float) -> None:
-    """A network that finds the joints in both views: the mean is where they are."""
+def test_looks_that_agree_change_nothing(angle_deg: float, looks: int) -> None:
+    """A network that finds the joints in every view: the mean is where they are."""
     joints = leaning(angle_deg)
     views: list[NDArray[np.uint8]] = []
 
@@ -64,14 +66,15 @@ def test_two_looks_that_agree_change_nothing(angle_deg: float) -> None:
         views.append(images)
         if len(views) == 1:
             return gaussians(joints)
-        lean = leans(gaussians(joints))[0]
-        matrix = mirrored_upright(lean, CELLS)
-        return gaussians((joints @ matrix[:, :2].T + matrix[:, 2])[list(LSP14.mirror)])
+        look = FURTHER[len(views) - 2]
+        matrix = upright(look, leans(gaussians(joints))[0], CELLS)
+        seen = joints @ matrix[:, :2].T + matrix[:, 2]
+        return gaussians(seen[list(LSP14.mirror)] if look.mirrored else seen)
 
     image = np.random.default_rng(0).integers(0, 255, (1, SIZE, SIZE, 3)).astype(np.uint8)
-    both = looked_at(run, image, 2)
-    assert len(views) == 2
-    found, _ = sub_cell_peaks(np.exp(both[:, :14]))
+    mean = looked_at(run, image, looks)
+    assert len(views) == looks
+    found, _ = sub_cell_peaks(np.exp(mean[:, :14]))
     np.testing.assert_allclose(found[0], joints, atol=0.15)
 
 
@@ -109,10 +112,38 @@ def test_who_is_seen_clearly_is_not_looked_at_again() -> None:
     assert not np.array_equal(both[1], doubtful[0])
 
 
-def test_a_card_cannot_ask_for_two_looks_at_beliefs(tmp_path: Path) -> None:
+def test_every_look_counts_the_same_and_is_taken_at_the_doubtful_only() -> None:
+    """Beliefs of 0.27, 0.5 and 0.88: looked at thrice, twice and once."""
+    heights = {3: -1.0, 2: 0.0, 1: 2.0}
+    first = np.concatenate([gaussians(leaning(0), top) for top in heights.values()])
+    asked: list[int] = []
+
+    def run(images: NDArray[np.uint8]) -> NDArray[np.float32]:
+        asked.append(len(images))
+        if len(asked) == 1:
+            return first
+        return np.full_like(first[: len(images)], 0.0 if len(asked) == 2 else -9.0)
+
+    seen = looked_at(run, np.zeros((3, SIZE, SIZE, 3), np.uint8), 3)
+    assert asked == [3, 2, 1]
+    middle = (..., CELLS // 2, CELLS // 2)
+    np.testing.assert_allclose(seen[0][middle], (first[0][middle] + 0 - 9) / 3, atol=1e-5)
+    np.testing.assert_allclose(seen[1][middle], first[1][middle] / 2, atol=1e-5)
+    np.testing.assert_array_equal(seen[2], first[2])
+
+
+def test_the_third_view_cuts_no_corner_off() -> None:
+    corners = np.array([[0, 0], [SIZE - 1, 0], [0, SIZE - 1], [SIZE - 1, SIZE - 1]])
+    matrix = upright(FURTHER[1], np.deg2rad(45), SIZE)
+    seen = corners @ matrix[:, :2].T + matrix[:, 2]
+    assert -0.5 <= seen.min()
+    assert seen.max() <= SIZE - 0.5
+
+
+def test_a_card_cannot_ask_for_several_looks_at_beliefs(tmp_path: Path) -> None:
     card = (WEIGHTS_DIR / "cpm-int8.json").read_text()
-    assert '"looks": 2' in card
+    assert '"looks": 3' in card
     path = tmp_path / "cpm-int8.json"
     path.write_text(card.replace('"maps": "logits"', '"maps": "beliefs"'))
-    with pytest.raises(ModelError, match="looks 2 needs maps logits"):
+    with pytest.raises(ModelError, match="looks 3 needs maps logits"):
         read_card(path)
