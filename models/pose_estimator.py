@@ -13,9 +13,9 @@ from models.card import WEIGHTS_DIR, ModelCard, PoseOutput
 from models.crop import square_crop
 from models.errors import ModelError
 from models.heatmaps import Floats, Joints2D, calibrated, read_maps
+from models.looks import looked_at
 from models.person_detector import PersonBox
 from models.providers import ProviderChoice, Runtime
-from models.looks import looked_at
 from models.session import OnnxModel
 
 

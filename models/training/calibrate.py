@@ -26,8 +26,8 @@ from models.card import (
 )
 from models.cost import cpu_ms
 from models.heatmaps import Floats, calibrated, read_maps
-from models.pck import correct_keypoints
 from models.looks import looked_at
+from models.pck import correct_keypoints
 from models.session import OnnxModel
 from models.training.augment import Sample, canonical, random_view
 from models.training.dataset import LabelledCrop, read_crops

@@ -18,8 +18,8 @@ from torch import Tensor
 from models.card import ModelCard, PoseOutput, read_card, write_card
 from models.errors import AnnotationError, ModelError
 from models.heatmaps import read_maps
-from models.pck import correct_keypoints
 from models.looks import looked_at
+from models.pck import correct_keypoints
 from models.session import OnnxModel
 from models.training import loop
 from models.training.augment import canonical, random_view
