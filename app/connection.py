@@ -6,7 +6,8 @@ a head that does not arrive               408 after ``patience_s``, closed witho
 a head that does not end                  431 after ``MAX_HEAD_BYTES``
 bytes that are no HTTP                    400
 the rest of a body refused unread         read and dropped for ``patience_s``, then closed; so it
-                                          is where the connection ends with the answer
+                                          is where the connection ends with the answer, and
+                                          there after ``MAX_DROPPED_BYTES`` at the latest
 an answer that the client does not take   closed after ``patience_s``
 ========================================= ==================================================
 
@@ -44,6 +45,8 @@ EarlyAnswer = Callable[[Scope], bytes | None]
 """The whole response to a request of which the head is read, if there is one already."""
 
 MAX_HEAD_BYTES = 65_536
+MAX_DROPPED_BYTES = 12_000_000
+"""Of an upload that is answered and closed: most clients look for the answer before that."""
 _UPGRADE = re.compile(rb"(?im)^Upgrade(?=[ \t]*:)")
 """Offers of h2c, as Java's client makes with every request, may be ignored (RFC 9110, 7.8), but the
 parser would take the body for the other protocol: it must not see them."""
@@ -63,6 +66,7 @@ class Connection(HttpToolsProtocol):
         self._timers: dict[str, asyncio.TimerHandle] = {}
         self._running: RequestResponseCycle | None = None
         self._head_bytes = 0
+        self._dropped_bytes = 0
         self._in_body = False
         self._expect("head", self.transport.close)
 
@@ -75,6 +79,11 @@ class Connection(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Feed the parser; a head may be split over many pieces but not over too many bytes."""
+        if self.transport.is_closing():  # for ours, the rest of an upload that is answered
+            self._dropped_bytes += len(data)
+            if self._dropped_bytes > MAX_DROPPED_BYTES:
+                self._give_up()
+                return
         if not self._in_body:
             end = data.find(b"\r\n\r\n")
             end = len(data) if end < 0 else end
