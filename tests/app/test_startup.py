@@ -52,7 +52,13 @@ def await_numpy(pid: int) -> None:
 
 def test_control_c_while_it_still_imports() -> None:
     command: list[str | Path] = [COMMAND, "serve", "--port", "0"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+    # A suite that runs in the background ignores Ctrl-C itself, and children would inherit that.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    with process:
         await_numpy(process.pid)
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=60)
