@@ -9,13 +9,14 @@ from typing import Annotated, Literal, Self, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from models.errors import ModelError
+from models.heatmaps import N_FEATURES
 
 WEIGHTS_DIR = Path(__file__).parent / "weights"
 """The weights that ship with the project."""
 
 
 class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class ConfidenceCalibration(_Frozen):
@@ -39,10 +40,10 @@ class PoseOutput(_Frozen):
 
     kind: Literal["pose"]
     joint_names: list[str]
-    input_px: int = Field(description="side of the square crop the network sees")
-    crop_scale: float = Field(description="crop's side over the joints' box's longer side")
-    stride_px: float = Field(description="input pixels per heat map cell")
-    target_sigma_cells: float = Field(description="blur of the training targets")
+    input_px: int = Field(gt=0, description="side of the square crop the network sees")
+    crop_scale: float = Field(gt=0, description="crop's side over the joints' box's longer side")
+    stride_px: float = Field(gt=0, description="input pixels per heat map cell")
+    target_sigma_cells: float = Field(ge=0, description="blur of the training targets")
     maps: Literal["logits", "beliefs"]
     border_grey: int = Field(0, ge=0, le=255, description="what crops have beyond the photo's edge")
     looks: Literal[1, 2, 3] = Field(1, description="how often a doubtful crop is looked at")
@@ -55,6 +56,17 @@ class PoseOutput(_Frozen):
             raise ValueError(f"looks are averaged as logits: looks {self.looks} needs maps logits")
         return self
 
+    @model_validator(mode="after")
+    def _all_joints_are_calibrated(self) -> Self:
+        n = len(self.joint_names)
+        if self.confidence is not None:
+            rows = self.confidence.coefficients
+            if len(rows) != n or any(len(row) != 1 + N_FEATURES for row in rows):
+                raise ValueError(f"confidence needs {1 + N_FEATURES} coefficients for {n} joints")
+        if self.spread is not None and len(self.spread.factor) != n:
+            raise ValueError(f"spread needs a factor for each of {n} joints")
+        return self
+
     @property
     def side_px(self) -> int:
         """Longer side of what the network sees."""
@@ -65,10 +77,10 @@ class DetectorOutput(_Frozen):
     """How a person network is fed and read."""
 
     kind: Literal["people"]
-    long_side_px: int = Field(description="the photo is shrunk until its longer side is this")
-    stride_px: int
-    unit_px: float = Field(description="distances are logarithms of multiples of this")
-    threshold: float = Field(description="least score of a person")
+    long_side_px: int = Field(gt=0, description="the photo is shrunk until its longer side is this")
+    stride_px: int = Field(gt=0)
+    unit_px: float = Field(gt=0, description="distances are logarithms of multiples of this")
+    threshold: float = Field(ge=0, le=1, description="least score of a person")
 
     @property
     def side_px(self) -> int:
@@ -133,7 +145,7 @@ class ModelCard(_Frozen):
 def read_card(path: Path) -> ModelCard:
     """Read and check a card; ``ModelError`` names the file and what is wrong with it."""
     try:
-        return ModelCard.model_validate_json(path.read_bytes())
+        card = ModelCard.model_validate_json(path.read_bytes())
     except FileNotFoundError:
         others = ", ".join(sorted(card.stem for card in path.parent.glob("*.json")))
         raise ModelError(
@@ -142,10 +154,18 @@ def read_card(path: Path) -> ModelCard:
             + "; restore it from the repository, choose another model with POSEMATCH_MODEL "
             "or point POSEMATCH_WEIGHTS_DIR at a directory that has it"
         ) from None
+    except OSError as error:
+        raise ModelError(f"model card {path} cannot be read: {error.strerror}") from error
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "the file"
         raise ModelError(f"model card {path} is not valid at {where}: {first['msg']}") from None
+    if card.name != path.stem:
+        raise ModelError(
+            f"model card {path} is of a model named {card.name!r}: models are asked for by the "
+            f"names of their cards, so rename the file to {card.name}.json or the model in it"
+        )
+    return card
 
 
 def write_card(path: Path, card: ModelCard) -> None:
@@ -162,6 +182,8 @@ def read_weights(path: Path, card: ModelCard) -> bytes:
         raise ModelError(
             f"model weights {path} are missing; restore the file from the repository"
         ) from None
+    except OSError as error:
+        raise ModelError(f"model weights {path} cannot be read: {error.strerror}") from error
     if hashlib.sha256(data).hexdigest() != card.sha256:
         raise ModelError(
             f"model weights {path} do not match their card (sha256 differs): the file is corrupt "

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Maps = NDArray[np.float32]
+N_FEATURES = 5
+"""See ``confidence_features``."""
 RESIDUE = 0.05
 """Beliefs below this share of the strongest are none."""
 
@@ -136,7 +138,7 @@ def peak_beliefs(maps: NDArray[np.float32], best: NDArray[np.int64], kind: str) 
 def confidence_features(
     peak: Floats, covariance_cells2: Floats, p: Maps, best: NDArray[np.int64], background: Floats
 ) -> Floats:
-    """What confidence is read from, (N, J, 5).
+    """What confidence is read from, (N, J, N_FEATURES).
 
     Logit of the peak belief (absence shows there, a normalised map has forgotten it), logarithm of
     the spread, the mass within three cells of the peak, the background map's belief there, and the

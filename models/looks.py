@@ -91,7 +91,7 @@ def _warped(planes: Maps, matrix: Floats) -> Maps:
 def belief(maps: Maps) -> NDArray[np.float32]:
     """How far logits (N, 15, h, w) believe in all joints: mean over their strongest cells (N,)."""
     strongest = maps[:, : LSP14.n_joints].reshape(len(maps), LSP14.n_joints, -1).max(-1)
-    mean: NDArray[np.float32] = (1 / (1 + np.exp(-strongest))).mean(1)
+    mean: NDArray[np.float32] = (1 / (1 + np.exp(-np.clip(strongest, -30, 30)))).mean(1)
     return mean
 
 

@@ -92,11 +92,12 @@ class OnnxModel:
         """The network takes and gives what its card says, in batches; ``ModelError`` if not."""
         probe = _probe(self.card)
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
-        if len(inputs) != 1 or len(outputs) != 1 or inputs[0].type != probe.kind:
+        kinds = [it.type for it in (*inputs, *outputs)]
+        if len(inputs) != 1 or kinds != [probe.kind, "tensor(float)"]:
             raise self._error(
-                f"another kind of network: expected {probe.wanted} and one "
+                f"another kind of network: expected {probe.wanted} and one float "
                 f"output, found {[f'{i.name} {i.type} {i.shape}' for i in inputs]} and "
-                f"{[o.name for o in outputs]}"
+                f"{[f'{o.name} {o.type}' for o in outputs]}"
             )
         self._input = inputs[0].name
         shape = inputs[0].shape

@@ -8,7 +8,7 @@ from library_store.skeleton import L_HIP, L_SHOULDER, LSP14, R_HIP, R_SHOULDER
 from models.card import WEIGHTS_DIR, read_card
 from models.errors import ModelError
 from models.heatmaps import sub_cell_peaks
-from models.looks import FURTHER, Look, leans, looked_at, upright
+from models.looks import FURTHER, Look, belief, leans, looked_at, upright
 
 CELLS, SIZE = 40, 160
 STRIDE = SIZE // CELLS
@@ -138,6 +138,11 @@ def test_the_third_view_cuts_no_corner_off() -> None:
     seen = corners @ matrix[:, :2].T + matrix[:, 2]
     assert seen.min() >= -0.5
     assert seen.max() <= SIZE - 0.5
+
+
+def test_beliefs_of_extreme_logits_are_numbers() -> None:
+    """Warnings are errors here: an exponential of a hundred is no float32."""
+    np.testing.assert_allclose(belief(np.full((1, 15, 4, 4), -200, np.float32)), 0, atol=1e-9)
 
 
 def test_a_card_cannot_ask_for_several_looks_at_beliefs(tmp_path: Path) -> None:

@@ -11,10 +11,11 @@ import onnxruntime as ort
 import pytest
 
 from models import ModelError, PersonDetector, PoseEstimator
-from models.card import WEIGHTS_DIR
+from models.card import WEIGHTS_DIR, read_card
+from models.choice import choose
 from models.session import OnnxModel
 from tests.models import tiny_onnx
-from tests.models.tiny_onnx import node, planes
+from tests.models.tiny_onnx import FLOAT16, node, planes
 
 
 @pytest.fixture
@@ -63,6 +64,46 @@ def test_a_card_with_a_wrong_value_names_the_field(weights: Path) -> None:
         PoseEstimator(weights_dir=weights)
 
 
+@pytest.mark.parametrize(
+    ("name", "field", "value", "said"),
+    [
+        ("cpm", "input_px", -1, "input_px"),
+        ("cpm", "stride_px", 0, "stride_px"),
+        ("cpm", "stride_px", float("nan"), "stride_px"),
+        ("cpm", "crop_scale", 0, "crop_scale"),
+        ("cpm", "confidence", {"coefficients": []}, "6 coefficients for 14 joints"),
+        ("cpm", "confidence", {"coefficients": [[1.0] * 5] * 14}, "6 coefficients for 14"),
+        ("cpm", "spread", {"factor": [1.0] * 13}, "a factor for each of 14 joints"),
+        ("person", "stride_px", 0, "stride_px"),
+        ("person", "unit_px", -32.0, "unit_px"),
+        ("person", "threshold", 2.0, "threshold"),
+    ],
+)
+def test_what_the_first_photo_would_fail_on_is_refused_at_start(
+    weights: Path, name: str, field: str, value: Any, said: str
+) -> None:
+    card = json.loads((weights / f"{name}.json").read_text())
+    output = card["output"]
+    output[field] = output[field] | value if isinstance(value, dict) else value
+    (weights / f"{name}.json").write_text(json.dumps(card))
+    with pytest.raises(ModelError, match=rf"{name}\.json is not valid at output.*{said}"):
+        read_card(weights / f"{name}.json")
+
+
+def test_a_card_goes_by_its_models_name(weights: Path) -> None:
+    (weights / "cpm.json").rename(weights / "mine.json")
+    with pytest.raises(ModelError, match=r"mine\.json is of a model named 'cpm'"):
+        choose(weights, "pose")
+
+
+@pytest.mark.parametrize("file", ["cpm.json", "cpm.onnx"])
+def test_a_file_that_cannot_be_read_is_named(weights: Path, file: str) -> None:
+    (weights / file).unlink()
+    (weights / file).mkdir()
+    with pytest.raises(ModelError, match=rf"{file} cannot be read: Is a directory"):
+        PoseEstimator(weights_dir=weights)
+
+
 def test_a_detector_is_no_pose_network_and_the_other_way_round() -> None:
     with pytest.raises(ModelError, match="no pose network"):
         PoseEstimator("person")
@@ -91,6 +132,12 @@ SOUND = tiny_onnx.model(planes())
             "Frobnicate",
         ),
         (tiny_onnx.model(planes(), kind=tiny_onnx.FLOAT), "expected one uint8 image input"),
+        (
+            tiny_onnx.model(
+                planes(node("Cast", ["planes"], "half", to=FLOAT16), last="half"), made=FLOAT16
+            ),
+            r"one float output, .* tensor\(float16\)",
+        ),
         (tiny_onnx.model(planes(), image=(1, 32, 32, 3)), "batch size must be free"),
         (tiny_onnx.model(planes(), image=("n", 64, 64, 3)), "as the card has it, are refused"),
         (
@@ -104,7 +151,7 @@ SOUND = tiny_onnx.model(planes())
             "not finite",
         ),
     ],
-    ids=["text", "cut", "opset", "operator", "floats", "one", "size", "maps", "nan"],
+    ids=["text", "cut", "opset", "operator", "floats", "halves", "one", "size", "maps", "nan"],
 )
 def test_foreign_networks_are_refused_with_a_reason_and_a_mend(
     tmp_path: Path, data: bytes, said: str

@@ -7,7 +7,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-UINT8, FLOAT = 2, 1
+UINT8, FLOAT, FLOAT16 = 2, 1, 10
 Axes = Sequence[int | str]
 
 
@@ -60,12 +60,13 @@ def model(
     *,
     image: Axes = ("n", 32, 32, 3),
     kind: int = UINT8,
+    made: int = FLOAT,
     opset: int = 17,
 ) -> bytes:
-    """A ModelProto from ``image`` to float ``maps``."""
+    """A ModelProto from ``image`` to ``maps``, float unless something else is ``made``."""
     graph = b"".join(_field(1, n) for n in nodes) + _field(2, "tiny")
     graph += _field(11, _value("image", kind, image))
-    graph += _field(12, _value("maps", FLOAT, ("a", "b", "c", "d")))
+    graph += _field(12, _value("maps", made, ("a", "b", "c", "d")))
     return _field(1, 8) + _field(7, graph) + _field(8, _field(2, opset))
 
 
