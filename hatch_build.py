@@ -16,6 +16,7 @@ COMPILED = {
         "app/lifting/resection.cpp",
         "app/lifting/ensemble.cpp",
         "app/lifting/evidence.cpp",
+        "app/lifting/update.cpp",
     ],
 }
 FLAGS = ["-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math", "-shared", "-fPIC"]

@@ -1,4 +1,4 @@
-"""The loops of lifting that are compiled: resection, ensemble and evidence.cpp.
+"""The loops of lifting that are compiled: resection, ensemble, evidence and update.cpp.
 
 They trust the shapes that they are told, so only the modules that check them call them. They run
 without Python's lock.
@@ -43,4 +43,17 @@ def compiled() -> ctypes.CDLL:
         *(number, number, array, array, array, real, array, array, array),
     ]
     library.posematch_evidence.restype = None
+    library.posematch_observe_state.argtypes = [
+        *(number, array, array, array, array, array, real, real),
+    ]
+    library.posematch_observe_state.restype = None
+    library.posematch_observe_pairs.argtypes = [
+        *(number, array, array, real, real, number, array, real),
+    ]
+    library.posematch_observe_pairs.restype = None
+    library.posematch_answer.argtypes = [
+        *(number, array, array, real, real, real, number, array, array),
+        *(number, number, real, number, array, array, array, array),
+    ]
+    library.posematch_answer.restype = real
     return library

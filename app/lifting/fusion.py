@@ -21,32 +21,16 @@ which way a foreshortened limb points. The whole is then made as tall as the nei
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
 
 import numpy as np
 
 from app.lifting.ensemble import Ensemble, LocalPrior, local_prior
 from app.lifting.evidence import Evidence
-from app.lifting.geometry import Floats, lift_to_depth
+from app.lifting.geometry import Floats
 from app.lifting.learned import apart_mm, misplaced, with_learned
-from app.lifting.posterior import STANDARD_PX_PER_MM
-from app.lifting.proportions import asymmetry
-from app.lifting.stature import expected_stature_mm
-from library_store.skeleton import L_HIP, LSP14, R_HIP
+from app.lifting.update import answer_of, made_symmetric
 from models.pose_lifter import LearnedPose
-
-_LIMBS = ("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")
-_LIMB_ENDS = np.stack(
-    [
-        np.eye(LSP14.n_joints)[LSP14.index(f"{side}_{end}")]
-        - np.eye(LSP14.n_joints)[LSP14.index(f"{side}_{start}")]
-        for side in ("r", "l")
-        for limb in _LIMBS
-        for start, end in pairwise(limb)
-    ]
-)
-"""(8, J): the far end of each limb segment less its near end."""
 
 
 @dataclass(frozen=True)
@@ -164,78 +148,20 @@ def fuse(
     if learned is not None:
         doubt = settings.doubt(evidence.mean_noise_var)
         posterior = with_learned(posterior, learned, ensemble.px_per_unit, doubt)
-    posterior = _made_symmetric(posterior, ensemble.px_per_unit, settings.asymmetry)
-    posterior = _made_as_tall(posterior, ensemble.px_per_unit, ensemble.stature_mm)
+    posterior = made_symmetric(posterior, ensemble.px_per_unit, settings.asymmetry)
+    answer = answer_of(posterior, ensemble.px_per_unit, ensemble.stature_mm)
     suspect = evidence.suspect(confidence[seen], settings.outlier_prior)
     outlier = None if suspect is None else int(seen[suspect])
-    spread = _spread_about_root(posterior)
+    spread = answer.spread_mm
     if learned is not None:
         # Both saw the same joints: how far they differ tells how far either may be wrong.
-        apart = apart_mm(of_neighbours, learned, ensemble.px_per_unit, posterior.root_depth_mm)
+        apart = apart_mm(of_neighbours, learned, ensemble.px_per_unit, answer.root_depth_mm)
         spread = np.hypot(spread, settings.disagreement * apart)
         outlier = misplaced(learned, points, confidence, ensemble.px_per_unit, outlier)
     return FusedPose(
-        joints_mm=_joints(posterior, ensemble.px_per_unit),
+        joints_mm=answer.joints_mm,
         spread_mm=spread,
         noise_px=float(np.sqrt(evidence.mean_noise_var)),
         outlier=outlier,
-        ambiguous=_is_ambiguous(posterior, settings),
+        ambiguous=answer.is_ambiguous(settings.ambiguous_sigmas, settings.ambiguous_mm),
     )
-
-
-def _joints(pose: LocalPrior, px_per_unit: float) -> Floats:
-    """The mean state as joints (J, 3) mm."""
-    n = LSP14.n_joints
-    points = pose.mean[: 2 * n].reshape(n, 2) / px_per_unit
-    return lift_to_depth(points, pose.root_depth_mm * (1.0 + pose.mean[2 * n :]))
-
-
-def _made_symmetric(pose: LocalPrior, px_per_unit: float, sigma: float) -> LocalPrior:
-    """Observe that paired segments are equally long, but for ``sigma`` of their log ratio."""
-    n = LSP14.n_joints
-    joints = _joints(pose, px_per_unit)
-    ratio, slope = asymmetry(joints)
-    # From joints in mm to the state: X = (p z, z) with p in pixels and z = z_root (1 + depth).
-    by_image = slope[..., :2] * (joints[:, 2:] / px_per_unit)
-    by_depth = pose.root_depth_mm * (
-        (slope[..., :2] * joints[:, :2]).sum(-1) / joints[:, 2] + slope[..., 2]
-    )
-    jacobian = np.concatenate([by_image.reshape(len(ratio), 2 * n), by_depth], axis=1)
-    reach = pose.covariance @ jacobian.T
-    gain = np.linalg.solve(jacobian @ reach + sigma**2 * np.eye(len(ratio)), reach.T).T
-    return LocalPrior(
-        pose.mean - gain @ ratio, pose.covariance - gain @ reach.T, pose.root_depth_mm
-    )
-
-
-def _made_as_tall(pose: LocalPrior, px_per_unit: float, stature_mm: float) -> LocalPrior:
-    """At the distance at which the person is so tall; no image or direction changes."""
-    n = LSP14.n_joints
-    depth = pose.root_depth_mm
-    image = pose.covariance[: 2 * n, : 2 * n].reshape(n, 2, n, 2) * (depth / px_per_unit) ** 2
-    along = pose.covariance[2 * n :, 2 * n :] * depth**2
-    covariance = np.stack([image[:, 0, :, 0], image[:, 1, :, 1], along])
-    expected = expected_stature_mm(_joints(pose, px_per_unit), covariance)
-    return replace(pose, root_depth_mm=depth * stature_mm / expected)
-
-
-def _is_ambiguous(pose: LocalPrior, settings: FusionSettings) -> bool:
-    """Whether some limb may as well point towards the camera as away from it."""
-    depths = slice(2 * LSP14.n_joints, None)
-    along = _LIMB_ENDS @ pose.mean[depths]
-    variance = ((_LIMB_ENDS @ pose.covariance[depths, depths]) * _LIMB_ENDS).sum(1)
-    sigma = np.sqrt(np.maximum(variance, 0.0))
-    undecided = np.abs(along) < settings.ambiguous_sigmas * sigma
-    return bool((undecided & (sigma * pose.root_depth_mm > settings.ambiguous_mm)).any())
-
-
-def _spread_about_root(pose: LocalPrior) -> Floats:
-    """Standard deviation (J,) in mm of joints about the hip midpoint."""
-    n = LSP14.n_joints
-    position_var = np.diag(pose.covariance)[: 2 * n].reshape(n, 2).sum(1)
-    from_root = np.eye(n)
-    from_root[:, [R_HIP, L_HIP]] -= 0.5
-    depth_var = ((from_root @ pose.covariance[2 * n :, 2 * n :]) * from_root).sum(1)
-    variance = depth_var * pose.root_depth_mm**2 + position_var / STANDARD_PX_PER_MM**2
-    spread: Floats = np.sqrt(np.maximum(variance, 0.0))
-    return spread

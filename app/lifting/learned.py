@@ -9,8 +9,8 @@ with the covariance of its errors, so the update is that of any observation:
 with P the fused posterior and R the network's covariance. Both have looked at the same 2D joints,
 so their errors are not independent, and neither's are quite as large as it says: κ (``doubt``)
 weighs one against the other. What is left of the covariance is that of a gain so weighed and of
-network errors with twice the covariance that was foretold. How large the person is stays what the
-neighbours say; the network does not know.
+network errors with twice the covariance that was foretold. How large the person is stays
+what the neighbours say; the network does not know.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from app.lifting.ensemble import LocalPrior
 from app.lifting.geometry import Floats
 from app.lifting.posterior import STANDARD_PX_PER_MM
+from app.lifting.update import observe_state
 from library_store.skeleton import L_HIP, LSP14, R_HIP
 from models.pose_lifter import LearnedPose
 
@@ -75,18 +76,15 @@ def with_learned(
 
     """
     n = LSP14.n_joints
-    to_state = np.concatenate([np.full(2 * n, px_per_unit), np.ones(n)])
-    settled = _SETTLED_PX * to_state / px_per_unit
-    error = to_state[:, None] * learned.covariance * to_state
-    seen = np.concatenate([px_per_unit * learned.points.ravel(), learned.depths])
-    total = pose.covariance + doubt * error + np.diag(settled**2)
-    gain = np.linalg.solve(total, pose.covariance).T
-    # (1 - K) P (1 - K)ᵀ + K R Kᵀ, of another R than K is best for.
-    misjudged = (_ERRORS - doubt) * (gain @ error @ gain.T)
-    return LocalPrior(
-        pose.mean + gain @ (seen - pose.mean),
-        pose.covariance - gain @ pose.covariance + misjudged,
-        pose.root_depth_mm,
+    to_state = np.ones(3 * n)
+    to_state[: 2 * n] = px_per_unit
+    return observe_state(
+        pose,
+        np.concatenate([px_per_unit * learned.points.ravel(), learned.depths]),
+        to_state[:, None] * learned.covariance * to_state,
+        settled_var=np.square(_SETTLED_PX / px_per_unit * to_state),
+        doubt=doubt,
+        errors=_ERRORS,
     )
 
 

@@ -75,19 +75,3 @@ def _paired_segments() -> tuple[tuple[Segment, Segment], ...]:
 
 
 SYMMETRIC_SEGMENTS = _paired_segments()
-_STARTS, _ENDS = np.moveaxis(np.array(SYMMETRIC_SEGMENTS), 2, 0)
-_INCIDENCE: Floats = np.eye(LSP14.n_joints)[_ENDS] - np.eye(LSP14.n_joints)[_STARTS]
-"""(5, 2, J): times joints, the segments."""
-_SIGNED_INCIDENCE = np.swapaxes(_INCIDENCE, 1, 2) * np.array([1.0, -1.0])
-"""(5, J, 2): from the segments back to their joints, the left ones subtracted."""
-
-
-def asymmetry(joints_mm: Floats) -> tuple[Floats, Floats]:
-    """Log ratios right to left of the five paired segments of a pose (J, 3), and their derivative.
-
-    Returns (5,) and (5, J, 3) a mm.
-    """
-    segment = _INCIDENCE @ joints_mm
-    squared = np.maximum((segment**2).sum(-1, keepdims=True), 1.0)
-    logs = 0.5 * np.log(squared[..., 0])
-    return logs[:, 0] - logs[:, 1], _SIGNED_INCIDENCE @ (segment / squared)

@@ -37,8 +37,10 @@ def _difference(end: int, start: int | None) -> Floats:
     return row
 
 
-_SEGMENTS = np.stack([_difference(*ends) for ends in (*_TRUNK, *_LEGS)])
-_SHARES = STATURE_PER_SEGMENTS * np.array([1.0, 1.0, *_HALF])
+STATURE_SEGMENTS = np.stack([_difference(*ends) for ends in (*_TRUNK, *_LEGS)])
+"""(6, J): times joints, the segments that the standing height is the sum of."""
+STATURE_SHARES = STATURE_PER_SEGMENTS * np.array([1.0, 1.0, *_HALF])
+"""(6,): what the length of each adds to it."""
 
 
 def stature_mm(joints_mm: Floats) -> Floats:
@@ -47,21 +49,5 @@ def stature_mm(joints_mm: Floats) -> Floats:
     The sum of the segments head top - neck - hip midpoint - knee - ankle, legs averaged over the
     two sides, times :data:`STATURE_PER_SEGMENTS`.
     """
-    height: Floats = np.sqrt(((_SEGMENTS @ joints_mm) ** 2).sum(-1)) @ _SHARES
+    height: Floats = np.sqrt(((STATURE_SEGMENTS @ joints_mm) ** 2).sum(-1)) @ STATURE_SHARES
     return height
-
-
-def expected_stature_mm(joints_mm: Floats, covariance_mm2: Floats) -> float:
-    """Stature of a pose that is known only so far.
-
-    The mean of many poses has shorter segments than any of them: what it lacks is their spread,
-    ``E|s|² = |E s|² + tr Cov s``.
-
-    Args:
-        joints_mm: (14, 3) the mean pose.
-        covariance_mm2: (3, 14, 14) between joints, along each axis.
-
-    """
-    spread = ((_SEGMENTS @ covariance_mm2) * _SEGMENTS).sum(-1).sum(0)
-    squared = ((_SEGMENTS @ joints_mm) ** 2).sum(-1) + np.maximum(spread, 0.0)
-    return float(np.sqrt(squared) @ _SHARES)

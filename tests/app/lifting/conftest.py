@@ -10,6 +10,7 @@ import pytest
 
 from app.lifting.geometry import Floats, project
 from app.lifting.lifter import Lifter
+from app.lifting.proportions import SYMMETRIC_SEGMENTS
 from app.lifting.types import Intrinsics, LiftedPerson, Method, Observation
 from library_store.build import BuildSettings, build_library
 from library_store.library import Library, load
@@ -31,6 +32,14 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Library]:
 @pytest.fixture(scope="session")
 def lifter(library: Library) -> Lifter:
     return Lifter(library)
+
+
+def asymmetry(joints_mm: Floats) -> Floats:
+    """Log ratios (5,) right to left of the paired segments of a pose (14, 3)."""
+    starts, ends = np.moveaxis(np.array(SYMMETRIC_SEGMENTS), 2, 0)
+    lengths = np.linalg.norm(joints_mm[ends] - joints_mm[starts], axis=-1)
+    ratios: Floats = np.log(lengths[:, 0] / lengths[:, 1])
+    return ratios
 
 
 @dataclass(frozen=True)

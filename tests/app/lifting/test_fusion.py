@@ -5,10 +5,10 @@ from app.lifting.ensemble import Ensemble, localisation, place_ensemble
 from app.lifting.fusion import FusionSettings, fuse
 from app.lifting.geometry import Floats, lift_to_depth, normalised_projection
 from app.lifting.posterior import standard_px_per_unit
-from app.lifting.proportions import asymmetry
 from app.lifting.stature import stature_mm
 from evaluation.metrics import similarity_error_mm
 from library_store.library import Library
+from tests.app.lifting.conftest import asymmetry
 
 ROOT_DEPTH_MM = 4000.0
 PX = standard_px_per_unit(ROOT_DEPTH_MM)
@@ -174,6 +174,6 @@ def test_sides_come_out_equally_long(library: Library) -> None:
             )
             for near, seen in zip(found, points, strict=True)
         ]
-        ratios.append(np.mean([np.abs(asymmetry(one.joints_mm)[0]).mean() for one in fused]))
+        ratios.append(np.mean([np.abs(asymmetry(one.joints_mm)).mean() for one in fused]))
         assert all(np.isfinite(one.spread_mm).all() for one in fused)
     assert ratios[0] < 0.6 * ratios[1]

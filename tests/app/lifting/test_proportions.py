@@ -1,6 +1,6 @@
 import numpy as np
 
-from app.lifting.proportions import PROPORTION_DIRECTIONS, asymmetry
+from app.lifting.proportions import PROPORTION_DIRECTIONS
 from app.lifting.stature import stature_mm
 from library_store.anatomy import measure_lengths
 from library_store.library import Library
@@ -25,17 +25,3 @@ def test_directions_change_lengths_and_neither_angles_nor_stature(library: Libra
     )
     # Seven independent directions of unit spread.
     np.testing.assert_allclose(moved_lengths @ moved_lengths.T, np.eye(7), atol=0.02)
-
-
-def test_asymmetry_and_its_derivative(library: Library) -> None:
-    pose = library.poses_mm(5)
-    ratio, derivative = asymmetry(pose)
-    assert np.abs(ratio).max() < 0.2
-    for joint, axis in ((3, 0), (8, 1), (13, 2), (1, 1)):
-        moved = pose.copy()
-        moved[joint, axis] += 1e-3
-        numeric = (asymmetry(moved)[0] - ratio) / 1e-3
-        np.testing.assert_allclose(derivative[:, joint, axis], numeric, atol=1e-8)
-    longer = pose.copy()
-    longer[4] += longer[4] - longer[3]
-    np.testing.assert_allclose((asymmetry(longer)[0] - ratio)[2], np.log(2.0))
