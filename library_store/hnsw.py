@@ -6,6 +6,7 @@ three quarters for 200; the graph takes 260 bytes an entry and most of the time 
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -133,6 +134,10 @@ def write_graph(
         if progress is not None:
             progress((labels[-1] + 1) / len(descriptors))
     graph.save_index(str(path))
+    # hnswlib says nothing when the disk is full.
+    missing = graph.index_file_size() - path.stat().st_size
+    if missing:
+        raise OSError(errno.ENOSPC, f"{missing} bytes could not be written", str(path))
 
 
 def ef_for(n: int) -> int:

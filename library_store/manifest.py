@@ -39,6 +39,9 @@ CONTENT_FILES = (
 )
 """The files that the same inputs and seed give byte for byte."""
 
+BACKENDS = ("cells", "hnsw")
+"""What a library may be built for; others search it too, :mod:`library_store.backends`."""
+
 MEND = (
     "delete the directory {directory} and start again: the default library is then built anew, "
     "another one by `posematch library build`"
@@ -136,12 +139,16 @@ def read_manifest(directory: Path) -> Manifest:
         content["licences"] = tuple(Licence(**licence) for licence in content["licences"])
         content["files"] = {name: FileSum(**total) for name, total in content["files"].items()}
         manifest = Manifest(**content)
-        consistent = manifest.sha256 == content_digest(manifest.files)
+        consistent = (
+            manifest.sha256 == content_digest(manifest.files)
+            and manifest.index["backend"] in BACKENDS
+            and {*manifest.index["files"]} <= manifest.files.keys()
+        )
     except (KeyError, TypeError, AttributeError) as error:
         raise LibraryError(f"{path} is not a library manifest ({error!r}); {mend}") from error
     if not consistent:
         raise LibraryError(
-            f"{path} contradicts itself: its sha256 is not that of its files; {mend}"
+            f"{path} contradicts itself: its sha256 or its index is not that of its files; {mend}"
         )
     return manifest
 

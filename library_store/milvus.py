@@ -178,6 +178,7 @@ def open_milvus(manifest: Manifest, settings: MilvusSettings, describe: Describe
     deadline_s = time.monotonic() + settings.start_timeout_s
     pause_s = 0.2
     while True:
+        client = None
         try:
             client = connect(settings)
             present = client.has_collection(name, timeout=settings.start_timeout_s)
@@ -186,6 +187,8 @@ def open_milvus(manifest: Manifest, settings: MilvusSettings, describe: Describe
             n = count(client, name, settings.start_timeout_s) if present else 0
             break
         except failures() as error:
+            if client is not None:
+                client.close()
             if time.monotonic() + pause_s > deadline_s:
                 raise LibraryError(
                     f"Milvus at {settings.uri} does not answer ({error}); start it, or search "

@@ -48,7 +48,9 @@ def landing(directory: Path) -> Path:
 
 
 def _is_ours(path: Path) -> bool:
-    return path.name in (MANIFEST, *CONTENT_FILES) or path.name.startswith("index.")
+    # Not whatever is called index: a web page may lie beside a manifest.json too.
+    index = path.name.startswith("index.") and path.suffix in {".npy", ".npz", ".hnsw"}
+    return index or path.name in (MANIFEST, *CONTENT_FILES)
 
 
 @contextmanager

@@ -24,6 +24,8 @@ Rows = NDArray[np.int64]
 _BLOCK = 512
 _BAND = 0.01
 """Squared distances this near to the radius' square, relatively, are taken in double precision."""
+_ROUNDING = 1e-6
+"""And so are those that single precision may get wrong, relative to the poses' squared lengths."""
 
 
 def greedy_cover(
@@ -86,12 +88,14 @@ def _cover_among(flat: Poses, rows: Rows, limit: float) -> NDArray[np.bool_]:
 def _near(flat: Poses, rows: Rows, others: Rows, limit: float) -> NDArray[np.bool_]:
     """(rows, others): whether their squared distance is within the limit."""
     a, b = flat[rows], flat[others]
+    squares_a, squares_b = (a * a).sum(axis=1), (b * b).sum(axis=1)
     squared = a @ b.T
     squared *= -2.0
-    squared += (a * a).sum(axis=1)[:, None]
-    squared += (b * b).sum(axis=1)
+    squared += squares_a[:, None]
+    squared += squares_b
     near: NDArray[np.bool_] = squared <= limit
-    unclear = np.argwhere(np.abs(squared - limit) <= _BAND * limit)
+    band = _BAND * limit + _ROUNDING * float(squares_a.max(initial=0) + squares_b.max(initial=0))
+    unclear = np.argwhere(np.abs(squared - limit) <= band)
     if len(unclear):
         i, j = unclear.T
         gap = a[i].astype(np.float64) - b[j]

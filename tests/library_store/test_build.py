@@ -263,7 +263,11 @@ def test_what_is_no_library_is_never_replaced(prior: PosePrior, tmp_path: Path) 
         with pytest.raises(LibraryError, match=rf"{target} .*{problem}.* would be lost"):
             build_library(target, prior, TINY)
     assert [path.name for path in tmp_path.rglob("*")] == ["photos", "a.jpg"]
-    (photos / "a.jpg").unlink()
+    (photos / "a.jpg").rename(photos / "index.html")
+    (photos / "manifest.json").write_text("{}")  # a web application has one too
+    with pytest.raises(LibraryError, match=r"holds index\.html"):
+        build_library(photos, prior, TINY)
+    (photos / "index.html").unlink()
     build_library(photos, prior, TINY)
     verify_library(photos)
 
@@ -339,6 +343,26 @@ def test_a_manifest_that_contradicts_itself_is_refused(tiny: Path) -> None:
     (tiny / MANIFEST).write_text(replace(manifest, n_poses=299).to_json())
     with pytest.raises(LibraryError, match=r"poses\.npy holds \(300, 14, 3\)"):
         load(tiny)
+
+
+@pytest.mark.parametrize(
+    ("written", "damaged"),
+    [
+        ('"backend": ', '"fackend": '),
+        ('"backend": "hnsw"', '"backend": "hnsv"'),
+        ('"index.codes.npy": {', '"index.coded.npy": {'),
+        ('"index.codes.npy",', '"index.coded.npy",'),
+    ],
+)
+def test_a_manifest_whose_index_is_another_is_refused(
+    written: str, damaged: str, tiny: Path
+) -> None:
+    text = (tiny / MANIFEST).read_text()
+    assert text.count(written) == 1
+    (tiny / MANIFEST).write_text(text.replace(written, damaged))
+    for opened in (load, verify_library):
+        with pytest.raises(LibraryError, match=r"manifest\.json (contradicts|is not a library)"):
+            opened(tiny)
 
 
 def test_no_library_at_all(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import resource
+import signal
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -169,6 +171,19 @@ def test_files_of_another_table_are_refused(
     cut.write_bytes((directory / HNSW_FILE).read_bytes()[:100])
     with pytest.raises(LibraryError, match=r"index\.hnsw"):
         HnswIndex.load(cut, table, cells)
+
+
+def test_a_graph_that_the_disk_does_not_take_is_an_error(table: np.ndarray, tmp_path: Path) -> None:
+    """Files of more than 50 kB are refused, as on a full disk. hnswlib alone says nothing."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, before[1]))
+    try:
+        with pytest.raises(OSError, match=r"bytes could not be written.*graph"):
+            write_graph(tmp_path / "graph", table, HnswSettings(threads=1))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
 
 
 def test_one_thread_builds_the_same_graph(table: np.ndarray, tmp_path: Path) -> None:

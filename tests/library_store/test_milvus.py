@@ -15,8 +15,9 @@ import httpx
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from pymilvus.exceptions import MilvusException
 
-from library_store import milvus_push
+from library_store import milvus, milvus_push
 from library_store.errors import IndexUnavailableError, LibraryError
 from library_store.library import Library, load
 from library_store.manifest import read_manifest
@@ -42,6 +43,31 @@ def nowhere(start_timeout_s: float = 0.3) -> MilvusSettings:
 def test_a_server_that_is_not_there_is_named(small_directory: Path) -> None:
     with pytest.raises(LibraryError, match=r"127\.0\.0\.1.* does not answer.*POSEMATCH_INDEX=auto"):
         load(small_directory, backend="milvus", milvus=nowhere())
+
+
+class Fleeting:
+    """A client whose Milvus goes away as soon as it is asked something."""
+
+    open = 0
+
+    def __init__(self, _: MilvusSettings) -> None:
+        Fleeting.open += 1
+
+    def has_collection(self, name: str, timeout: float) -> bool:
+        del timeout
+        raise MilvusException(message=f"gone before {name}")
+
+    def close(self) -> None:
+        Fleeting.open -= 1
+
+
+def test_every_client_that_was_opened_in_vain_is_closed(
+    small_directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(milvus, "connect", Fleeting)
+    with pytest.raises(LibraryError, match=r"does not answer .*gone before posematch_small"):
+        load(small_directory, backend="milvus", milvus=nowhere(0.5))
+    assert Fleeting.open == 0
 
 
 def test_a_push_to_nowhere_ends(small_directory: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -40,6 +40,19 @@ def test_all_are_covered_and_none_twice(n: int, seed: int, radius: float) -> Non
     assert_array_equal(kept, np.unique(kept))
 
 
+@pytest.mark.parametrize("radius", [0.0, 0.5, 1.0])
+def test_poses_far_apart_do_not_blur_near_ones(radius: float) -> None:
+    """Of lengths in the thousands, single precision tells no distances of a millimetre."""
+    rng = np.random.default_rng(0)
+    people = rng.normal(0.0, 600.0, (100, 14, 3))
+    shift = rng.normal(0.0, 0.55 * radius, (600, 14, 3))
+    poses = np.asarray(people[rng.integers(0, 100, 600)] + shift, dtype=np.float32)
+    kept = greedy_cover(poses, radius)
+    assert distances(poses, poses[kept]).min(axis=1).max() <= radius + 1e-6
+    among = distances(poses[kept], poses[kept])
+    assert np.all(among[~np.eye(len(kept), dtype=bool)] > radius)
+
+
 def test_blocks_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     poses = walk(3_000, 3, step_mm=20.0)
     whole = greedy_cover(poses, 25.0)
