@@ -294,7 +294,7 @@ def sample(
     if not cv2.haveImageWriter(str(out)):
         raise typer.BadParameter(f"{out} is no picture: .png, .jpg", param_hint="--out")
     directory = library or build_if_missing(load_settings())
-    opened = load(directory, verify=False, backend="exact")
+    opened = load(directory, backend="exact")
     entries = draw_entries(opened, count, chosen, seed)
     if not entries:
         raise typer.BadParameter(f"{directory} has no {kind} exemplars", param_hint="--kind")

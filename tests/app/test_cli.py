@@ -16,6 +16,7 @@ from app.cli import cli
 from app.commands.predict import picture_targets
 from app.schemas import BatchItem, PosesAnswer
 from app.version import VERSION
+from library_store.errors import LibraryError
 from tests.app.conftest import RENDERS
 from tests.app.server import COMMAND, environment
 from tests.library_store.clips import clip, write_clips
@@ -237,6 +238,10 @@ def test_a_library_of_ones_own(tmp_path: Path) -> None:
     for option, value in (("--kind", "dreamt"), ("--out", tmp_path / "sheet.txt")):
         wrong = invoke("library", "sample", own, option, value)
         assert (wrong.exit_code, option in wrong.stderr) == (2, True)
+    damaged = shutil.copytree(own, tmp_path / "damaged") / "descriptors.npy"
+    damaged.write_bytes(damaged.read_bytes().replace(b")", b",", 1))  # in the header
+    broken = invoke("library", "sample", damaged.parent, "--out", sheet)
+    assert isinstance(broken.exception, LibraryError)
     other = tmp_path / "other"
     both = (*build[:3], other, "--from", files["b"], "--prior", "default", "--size", 200)
     assert invoke(*both).exit_code == 0
