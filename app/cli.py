@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+from io import TextIOWrapper
 
 import typer
 from rich.markup import escape
@@ -38,6 +40,9 @@ def print_version() -> None:
 
 def main() -> None:
     """Run the command; an error made on purpose is one line on stderr and exit code 1."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # a name or sign that it has no letters for
+            stream.reconfigure(errors="backslashreplace")
     try:
         cli()
     except RequestError as error:
@@ -46,13 +51,18 @@ def main() -> None:
     except (LibraryError, ModelError) as error:
         notices.print(f"[red]error:[/red] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(1)
-    except (FileNotFoundError, PermissionError, NotADirectoryError, IsADirectoryError) as error:
-        # Of a path that the user gave: what the service itself needs has errors of its own.
+    except OSError as error:
+        # Of a path that the user gave, or of a full disk under what is printed: what the service
+        # itself needs has errors of its own.
+        place = "the output" if error.filename is None else str(error.filename)
         notices.print(
-            f"[red]error:[/red] {escape(str(error.filename))}: {error.strerror}",
+            f"[red]error:[/red] {escape(place)}: {error.strerror or error}",
             highlight=False,
             soft_wrap=True,
         )
+        if error.filename is None and sys.__stdout__ is not None:
+            # What is left to be written would fail once more at exit.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.__stdout__.fileno())
         sys.exit(1)
     except PoseMatchError as error:
         notices.print(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 from urllib.parse import urlsplit
@@ -17,13 +18,18 @@ from library_store.backends import Backend
 from models import ProviderChoice
 
 ENV_PREFIX = "POSEMATCH_"
+_ORIGIN = re.compile(r"http://[a-z0-9._:\[\]-]+(?<!:80)|https://[a-z0-9._:\[\]-]+(?<!:443)")
+"""Lower case, without a path; a scheme's own port is left out."""
 LIFTER_OFF = "off"
 """``Settings.lifter`` of a service that lifts by matching alone."""
 
 
 def default_cache_dir() -> Path:
     """Where built libraries are kept: the user's cache, so that every checkout shares it."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    try:
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError as error:  # a user without a home, as in some containers
+        raise StartupError("this user has no home directory: set POSEMATCH_CACHE_DIR") from error
     return Path(base) / "posematch"
 
 
@@ -178,26 +184,43 @@ class Settings(BaseSettings):
     def _split_commas(cls, value: Any) -> Any:
         if isinstance(value, str):
             parts = tuple(part.strip() for part in value.split(",") if part.strip())
-            if value.strip() and not parts:  # keys that are none would leave the door open
-                raise ValueError("lists nothing, but commas")
+            if not parts:  # keys that are none would leave the door open
+                raise ValueError("lists nothing; unset it for none")
             return parts
         return value
 
     @field_validator("api_keys")
     @classmethod
-    def _long_enough(cls, keys: tuple[SecretStr, ...]) -> tuple[SecretStr, ...]:
-        if any(len(key.get_secret_value()) < 16 for key in keys):
+    def _are_keys(cls, keys: tuple[SecretStr, ...]) -> tuple[SecretStr, ...]:
+        texts = [key.get_secret_value() for key in keys]
+        if any(len(text) < 16 for text in texts):
             raise ValueError("an API key needs at least 16 characters")
+        if not all(text.isascii() and text.isprintable() for text in texts):
+            raise ValueError("an API key has ASCII characters only: it is sent in a header")
         return keys
 
     @field_validator("cors_origins")
     @classmethod
     def _are_origins(cls, origins: tuple[str, ...]) -> tuple[str, ...]:
         for origin in origins:
-            scheme, _, rest = origin.partition("://")
-            if origin != "*" and (scheme not in {"http", "https"} or not rest or "/" in rest):
-                raise ValueError(f"{origin!r} is not an origin like https://example.org")
+            if origin != "*" and not _ORIGIN.fullmatch(origin):
+                raise ValueError(
+                    f"{origin!r} is not an origin as browsers send it, like https://example.org"
+                )
         return origins
+
+    @field_validator("host")
+    @classmethod
+    def _may_be_a_host(cls, host: str) -> str:
+        host.encode("idna")  # a UnicodeError is a ValueError
+        return host
+
+    @field_validator("cache_dir", "library_dir", "weights_dir", mode="before")
+    @classmethod
+    def _is_not_empty(cls, directory: Any) -> Any:
+        if directory == "":  # it would be the current directory
+            raise ValueError("is empty; unset it for the default")
+        return directory
 
     @field_validator("milvus_uri")
     @classmethod

@@ -15,7 +15,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from app.commands.console import build_if_missing, output
+from app.commands.console import build_if_missing, output, print_json
 from app.commands.machine import describe_cpu
 from app.engine import Engine, load_engine
 from app.pipeline import PhotoQuery
@@ -65,7 +65,7 @@ def bench(
     speeds = [measure(engine, data, threads, seconds) for threads in counts]
     if as_json:
         about = {"photo": photo.name, "cpu": describe_cpu(), "python": platform.python_version()}
-        output.print_json(json.dumps({**about, "runs": [asdict(speed) for speed in speeds]}))
+        print_json(json.dumps({**about, "runs": [asdict(speed) for speed in speeds]}))
         return
     output.print(f"{photo.name} on {describe_cpu()}", highlight=False, markup=False)
     output.print(_table(speeds))

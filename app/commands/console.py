@@ -16,6 +16,11 @@ output = Console()
 notices = Console(stderr=True)
 
 
+def print_json(text: str) -> None:
+    """JSON, indented; escaped where the terminal or pipe is not of UTF-8."""
+    output.print_json(text, ensure_ascii=not output.encoding.startswith("utf"))
+
+
 @contextmanager
 def stage_progress() -> Iterator[Callable[[str, float], None]]:
     """A bar per stage on stderr; yields the callback that stages report their fraction to."""

@@ -12,11 +12,11 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from http.client import HTTPException
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib import request
-from urllib.error import URLError
 
 import numpy as np
 import onnxruntime as ort
@@ -24,10 +24,10 @@ import typer
 from rich.markup import escape
 
 from app.commands.bench import SAMPLE
-from app.commands.console import output
+from app.commands.console import output, print_json
 from app.commands.machine import cpu_flags, describe_cpu, memory
 from app.engine import chosen_networks, load_engine
-from app.errors import StartupError
+from app.errors import RequestError, StartupError
 from app.pipeline import PhotoQuery
 from app.settings import LIFTER_OFF, Settings, load_settings
 from library_store.build import default_library_dir, verify_library
@@ -75,7 +75,7 @@ def doctor(
     failed = any(finding.state == "failure" for finding in findings)
     if as_json:
         report = {"can_serve": not failed, "findings": [asdict(it) for it in findings]}
-        output.print_json(json.dumps(report))
+        print_json(json.dumps(report))
     if failed:
         raise typer.Exit(1)
 
@@ -213,7 +213,7 @@ def _answers(settings: Settings) -> bool:
     try:
         with request.urlopen(f"http://{host}:{settings.port}/openapi.json", timeout=2) as answer:
             document = json.load(answer)
-    except (URLError, OSError, ValueError):
+    except (OSError, ValueError, HTTPException):
         return False
     return isinstance(document, dict) and document.get("info", {}).get("title") == "posematch"
 
@@ -274,8 +274,11 @@ def _library(settings: Settings) -> Finding:
         manifest = verify_library(directory)
     except LibraryError as error:
         said, mend = _split(str(error))
-        rebuilt = "delete that directory; the next start builds it again"
-        return Finding("library", "failure", said, mend or rebuilt)
+        if settings.library_dir is None:
+            otherwise = "delete that directory; the next start builds it again"
+        else:
+            otherwise = "set POSEMATCH_LIBRARY_DIR to the directory of a library"
+        return Finding("library", "failure", said, mend or otherwise)
     except OSError as error:
         said = f"{directory} cannot be read: {error.strerror}"
         return Finding("library", "failure", said, "make it readable")
@@ -291,11 +294,16 @@ def _photo(settings: Settings) -> Finding:
         return Finding("a photo", "failure", *_split(str(error)))
     data = SAMPLE.read_bytes()
     times_ms = []
-    for _ in range(5):
-        started_s = time.perf_counter()
-        people = engine.pipeline.estimate(data, PhotoQuery()).people
-        times_ms.append(1e3 * (time.perf_counter() - started_s))
-    engine.library.close()
+    try:
+        for _ in range(5):
+            started_s = time.perf_counter()
+            people = engine.pipeline.estimate(data, PhotoQuery()).people
+            times_ms.append(1e3 * (time.perf_counter() - started_s))
+    except RequestError as error:
+        mend = "see that the settings let an ordinary photo pass"
+        return Finding("a photo", "failure", f"refused: {error.detail}", mend)
+    finally:
+        engine.library.close()
     median_ms = float(np.median(times_ms))
     said = f"{len(people)} of 1 person found, {median_ms:.0f} ms"
     if not people:

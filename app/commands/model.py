@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from app.commands.console import output
+from app.commands.console import output, print_json
 from app.engine import chosen_networks
 from app.settings import Settings, load_settings
 from models import ModelCard, ModelError, ProviderChoice
@@ -48,14 +48,14 @@ def print_card(
     if name is not None:
         card = _card(settings, name)
         if as_json:
-            output.print_json(card.model_dump_json())
+            print_json(card.model_dump_json())
         else:
             output.print(_card_table(card))
         return
     chosen = (*chosen_networks(settings), settings.lifter)
     cards = _all_cards(settings)
     if as_json:
-        output.print_json(json.dumps([card.model_dump(mode="json") for card in cards]))
+        print_json(json.dumps([card.model_dump(mode="json") for card in cards]))
         return
     table = Table()
     for heading in ("", "network", "version", "accuracy", "GFLOP", "parameters", "CPU-ms"):

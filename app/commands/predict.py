@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,7 +20,7 @@ from rich.table import Table
 from app import schemas
 from app.answers import poses_answer
 from app.api.problems import problem_of
-from app.commands.console import build_if_missing, notices, output
+from app.commands.console import build_if_missing, notices, output, print_json
 from app.drawing import PICTURE_TYPES, draw_result, encode_picture
 from app.engine import Engine, load_engine
 from app.errors import InvalidInputError, RequestError
@@ -145,7 +146,7 @@ def picture_targets(paths: Sequence[Path], image: Path | None, kind: str) -> lis
             )
         targets = [image]
     elif image.exists() and not image.is_dir():
-        raise typer.BadParameter("several photos need a folder", param_hint="--image")
+        raise typer.BadParameter(f"{image} is no folder", param_hint="--image")
     else:
         targets = [image / f"{name}.{kind}" for name in _distinct([path.stem for path in paths])]
     photos = {path.resolve() for path in paths}
@@ -188,9 +189,9 @@ def _estimate(
     engine: Engine, settings: Settings, path: Path, target: Path | None, query: PhotoQuery
 ) -> Outcome:
     try:
-        data = _read(path, settings.max_body_bytes)
+        data = read_photo(path, settings.max_body_bytes)
         result = engine.pipeline.estimate(data, query)
-        answer = poses_answer(engine, result, query.method, request_id=path.name)
+        answer = poses_answer(engine, result, query.method, request_id=_text(path.name))
         if target is not None:
             photo = decode_photo(
                 data, max_pixels=settings.max_pixels, side_px=settings.decode_side_px
@@ -202,14 +203,21 @@ def _estimate(
     return Outcome(path, answer, None)
 
 
-def _read(path: Path, most_bytes: int) -> bytes:
-    """The file, if it is no larger than what the service would take."""
+def read_photo(path: Path, most_bytes: int) -> bytes:
+    """The file; ``InvalidInputError`` if it is larger than what the service would take."""
     try:
-        if path.stat().st_size > most_bytes:
-            raise InvalidInputError([("photo", f"is larger than {most_bytes} bytes")])
-        return path.read_bytes()
+        with path.open("rb") as file:  # what is no plain file, as /dev/stdin, has no size
+            data = file.read(most_bytes + 1)
     except OSError as error:
         raise InvalidInputError([("photo", f"cannot be read: {error.strerror}")]) from error
+    if len(data) > most_bytes:
+        raise InvalidInputError([("photo", f"is larger than {most_bytes} bytes")])
+    return data
+
+
+def _text(path: str | Path) -> str:
+    """A path as JSON can hold it: bytes that are no UTF-8 become U+FFFD."""
+    return os.fsencode(path).decode(errors="replace")
 
 
 def _write(path: Path, data: bytes) -> None:
@@ -217,7 +225,7 @@ def _write(path: Path, data: bytes) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
     except OSError as error:
-        raise InvalidInputError([("image", f"{path}: {error.strerror}")]) from error
+        raise InvalidInputError([("image", f"{_text(path)}: {error.strerror}")]) from error
 
 
 @contextmanager
@@ -238,12 +246,14 @@ def _print_json(outcome: Outcome, alone: bool) -> None:
     """The answer itself of a photo that was named alone, else a line as in a batch's answer."""
     if alone:
         if outcome.answer is not None:
-            output.print_json(outcome.answer.model_dump_json())
+            print_json(outcome.answer.model_dump_json())
         return
-    name = str(outcome.path)
-    problem = None if outcome.error is None else problem_of(outcome.error, outcome.path.name)
+    name = _text(outcome.path)
+    problem = None
+    if outcome.error is not None:
+        problem = problem_of(outcome.error, _text(outcome.path.name))
     item = schemas.BatchItem(name=name, answer=outcome.answer, problem=problem)
-    typer.echo(item.model_dump_json())
+    typer.echo(item.model_dump_json().encode())  # JSON is UTF-8, whatever the terminal is of
 
 
 def _print_people(path: Path, answer: schemas.PosesAnswer) -> None:

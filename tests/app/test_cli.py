@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -10,10 +11,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 from typer.testing import CliRunner, Result
 
 from app.cli import cli
-from app.commands.predict import picture_targets
+from app.commands.predict import picture_targets, read_photo
+from app.errors import InvalidInputError
 from app.schemas import BatchItem, PosesAnswer
 from app.version import VERSION
 from library_store.errors import LibraryError
@@ -125,6 +128,45 @@ def test_predict_refuses_what_is_no_photo(library_dir: Path, tmp_path: Path) -> 
     done = run("predict", RENDERS / "000.jpg", library_dir=library_dir, max_body_bytes=1000)
     assert done.returncode == 1
     assert "1000 bytes" in done.stderr
+
+
+def test_predict_reads_no_more_than_a_photo_may_have() -> None:
+    photo = RENDERS / "000.jpg"
+    for path in (Path("/dev/zero"), photo):
+        with pytest.raises(InvalidInputError, match="larger than 10000 bytes"):
+            read_photo(path, 10_000)
+    size_bytes = photo.stat().st_size
+    assert len(read_photo(photo, size_bytes)) == size_bytes
+
+
+def test_names_and_terminals_without_the_letters(library_dir: Path, tmp_path: Path) -> None:
+    photos = [tmp_path / "fotö.jpg", Path(os.fsdecode(bytes(tmp_path) + b"/\xff.jpg"))]
+    for photo in photos:
+        shutil.copy(RENDERS / "000.jpg", photo)
+    plain = environment(library_dir=library_dir) | {"PYTHONIOENCODING": "ascii"}
+    for arguments in (photos, [photos[0], "--json"], [*photos, "--json"]):
+        done = subprocess.run(
+            [COMMAND, "predict", *arguments], env=plain, capture_output=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        if len(arguments) == 3:
+            names = [BatchItem.model_validate_json(line).name for line in done.stdout.splitlines()]
+            assert names == [str(photos[0]), f"{tmp_path}/\N{REPLACEMENT CHARACTER}.jpg"]
+        elif "--json" in arguments:
+            assert PosesAnswer.model_validate_json(done.stdout).request_id == "fotö.jpg"
+        else:
+            assert b"fot\\xf6.jpg: 640 x 480 px" in done.stdout
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
+@pytest.mark.parametrize("arguments", [["version"], ["evaluate"], ["--help"]])
+def test_a_full_disk_under_what_is_printed(arguments: list[str]) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [COMMAND, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert done.returncode == 1
+    assert done.stderr == "error: the output: No space left on device\n"
 
 
 def test_bench(library_dir: Path) -> None:

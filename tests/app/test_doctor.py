@@ -8,6 +8,7 @@ import re
 import shutil
 import socket
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import pytest
@@ -103,6 +104,36 @@ def test_the_port(tmp_path: Path, server: Server) -> None:
     assert "POSEMATCH_PORT" in findings["port"]["mend"]
     findings = examine(0, port=server.port, cache_dir=tmp_path)
     assert "already serving" in findings["port"]["said"]
+
+
+def test_a_port_where_something_speaks_no_http(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def greet() -> None:
+            connection, _ = listening.accept()
+            with connection:
+                connection.sendall(b"SSH-2.0-other\r\n")
+                connection.recv(1000)
+
+        greeting = Thread(target=greet)
+        greeting.start()
+        findings = examine(1, port=listening.getsockname()[1], cache_dir=tmp_path)
+        greeting.join()
+    assert findings["port"]["state"] == "failure"
+
+
+def test_settings_that_refuse_an_ordinary_photo(library_dir: Path) -> None:
+    finding = examine(1, library_dir=library_dir, max_pixels=1000)["a photo"]
+    assert finding["state"] == "failure"
+    assert "480 x 640" in finding["said"]
+
+
+def test_a_library_of_ones_own_is_not_to_be_deleted(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    finding = examine(1, library_dir=file)["library"]
+    assert finding["state"] == "failure"
+    assert "delete" not in finding["mend"]
 
 
 @pytest.mark.parametrize(

@@ -56,8 +56,18 @@ def test_unknown_settings_are_refused_with_a_hint(monkeypatch: pytest.MonkeyPatc
         ("MAX_BODY_BYTES", "100000000"),
         ("API_KEYS", "short"),
         ("API_KEYS", " , "),
+        ("API_KEYS", ""),
+        ("API_KEYS", "nöt-for-a-header-0123456789"),
         ("CORS_ORIGINS", "example.org"),
         ("CORS_ORIGINS", "https://example.org/path"),
+        ("CORS_ORIGINS", "https://Example.org"),
+        ("CORS_ORIGINS", "https://example.org:443"),
+        ("CORS_ORIGINS", "https://a b"),
+        ("HOST", "no..name"),
+        ("HOST", "a" * 70),
+        ("CACHE_DIR", ""),
+        ("LIBRARY_DIR", ""),
+        ("WEIGHTS_DIR", ""),
         ("QUOTA_PER_MINUTE", "10"),
         ("LOG_LEVEL", "chatty"),
         ("MILVUS_URI", "milvus"),
@@ -70,6 +80,23 @@ def test_nonsense_refuses_to_start(name: str, value: str, monkeypatch: pytest.Mo
     monkeypatch.setenv(f"POSEMATCH_{name}", value)
     with pytest.raises(StartupError):
         load_settings()
+
+
+@pytest.mark.parametrize("origin", ["*", "http://[::1]:8080", "https://a-b.example:80"])
+def test_origins_as_browsers_send_them(origin: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("POSEMATCH_CORS_ORIGINS", origin)
+    assert load_settings().cors_origins == (origin,)
+
+
+def test_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nowhere() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", nowhere)
+    with pytest.raises(StartupError, match="POSEMATCH_CACHE_DIR"):
+        load_settings()
+    assert load_settings(cache_dir=Path("cache")).cache_dir == Path("cache")
 
 
 def test_every_setting_is_described() -> None:
