@@ -12,6 +12,8 @@ from typing import Any
 
 import torch
 
+from models.training.loop import read_checkpoint
+
 
 def average(checkpoints: list[dict[str, Any]]) -> dict[str, Any]:
     """The last checkpoint with the mean of all averaged weights. One architecture only."""
@@ -34,7 +36,7 @@ def main() -> None:
     parser.add_argument("checkpoints", type=Path, nargs="+", help="in the order they were trained")
     parser.add_argument("--out", type=Path, required=True, help="a checkpoint to export")
     args = parser.parse_args()
-    states = [torch.load(p, map_location="cpu", weights_only=True) for p in args.checkpoints]
+    states = [read_checkpoint(p) for p in args.checkpoints]
     torch.save(average(states), args.out)
 
 

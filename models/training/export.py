@@ -21,6 +21,7 @@ from library_store.skeleton import LSP14
 from models.card import WEIGHTS_DIR, DetectorOutput, ModelCard, PoseOutput, write_card
 from models.errors import ModelError
 from models.training.augment import CROP_SCALE
+from models.training.loop import read_checkpoint
 from models.training.network import (
     BACKGROUND,
     ConvolutionalPoseMachine,
@@ -82,7 +83,7 @@ def read_weights(path: Path) -> dict[str, Tensor]:
 
 
 def config_of(weights: dict[str, Tensor]) -> CpmConfig:
-    """The sizes of a CPM, from its weights."""
+    """The sizes of a CPM, from its weights; ``KeyError`` when they are of another network."""
     score = weights["fine_score.weight"]
 
     def count(prefix: str) -> int:
@@ -168,17 +169,6 @@ def publish(model: onnx.ModelProto, card: ModelCard, directory: Path) -> ModelCa
     return card
 
 
-def _read_checkpoint(path: Path) -> dict[str, Any]:
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a reader of foreign bytes fails in every way
-        raise ModelError(f"{path} cannot be read as a training run's last.pt: {error}") from error
-    missing = {"config", "ema", "step"} - (state.keys() if isinstance(state, dict) else set())
-    if missing:
-        raise ModelError(f"{path} is not a training run's last.pt: no {', '.join(sorted(missing))}")
-    return dict(state)
-
-
 def export(
     checkpoint: Path,
     directory: Path,
@@ -196,7 +186,7 @@ def export(
     """
     if size_px is not None and size_px % COARSEST_STRIDE_PX:
         raise ModelError(f"an input of {size_px} px: a multiple of {COARSEST_STRIDE_PX} is wanted")
-    state = _read_checkpoint(checkpoint)
+    state = read_checkpoint(checkpoint)
     try:
         config = {**state["config"], "blocks": tuple(state["config"]["blocks"])}
         if kind == "cpm":

@@ -7,6 +7,7 @@ measured before and after through the files that are served.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -112,16 +113,24 @@ def finetune(
     """Train on ``crops`` from the weights of card ``start``; write ``out/name.onnx`` and card.
 
     ``source`` says in the card what was trained on. The training run itself is kept in
-    ``out/run`` and is resumed from there. Raises ``ModelError``.
+    ``out/run`` and is resumed from there. Raises ``ModelError``, also where ``out/run`` is of other
+    labels or settings: who was held out then may have been trained on there.
     """
     before_card = read_card(weights_dir / f"{start}.json")
     output = before_card.output
     if not isinstance(output, PoseOutput) or before_card.precision != "fp32":
         raise ModelError(f"model {start} cannot be trained on: name an fp32 pose network's card")
-    train, held = split(crops, settings.hold_out, settings.seed)
-    before = pck(weights_dir, start, held)
     path = weights_dir / before_card.file
-    config = config_of(read_weights(path))
+    try:
+        config = config_of(read_weights(path))
+    except KeyError as error:
+        raise ModelError(
+            f"model {start} cannot be trained on: it has no {error} as networks of this "
+            "architecture do; name another in --start"
+        ) from error
+    train, held = split(crops, settings.hold_out, settings.seed)
+    _keep_to(out / "run", _inputs(crops, before_card, settings))
+    before = pck(weights_dir, start, held)
     size = output.input_px
     device = "cuda" if torch.cuda.is_available() else "cpu"
     args = argparse.Namespace(
@@ -158,7 +167,7 @@ def finetune(
         evaluate=lambda model, px: {"pck_0.2/held_out": measure(model, held, px, device)},
         config=config.as_dict(),
     )
-    state = torch.load(args.out / "last.pt", map_location="cpu", weights_only=True)
+    state = loop.read_checkpoint(args.out / "last.pt")
     network = ConvolutionalPoseMachine(config)
     network.load_state_dict(state["ema"])
     network.eval()
@@ -186,6 +195,29 @@ def finetune(
     card = card.model_copy(update={"measured": measured})
     write_card(out / f"{name}.json", card)
     return FinetuneResult(card, len(train), len(held), before, after)
+
+
+def _inputs(crops: list[LabelledCrop], start: ModelCard, settings: FinetuneSettings) -> str:
+    """Digest of what decides who is held out and what is learned, but for how long."""
+    digest = hashlib.sha256(f"{start.sha256} {settings.hold_out} {settings.seed}".encode())
+    for crop in crops:
+        digest.update(crop.name.encode())
+        for part in (crop.image, crop.joints_px, crop.visible):
+            digest.update(part.tobytes())
+    return digest.hexdigest()
+
+
+def _keep_to(run: Path, inputs: str) -> None:
+    """Note what ``run`` learns from; ``ModelError`` when it has begun with something else."""
+    note = run / "inputs.sha256"
+    known = note.read_text(encoding="utf-8") if note.exists() else ""
+    if (run / "last.pt").exists() and known != inputs:
+        raise ModelError(
+            f"{run} has been trained on other labels, from other weights or with another --seed or "
+            "--hold-out: whom it has learned may be held out now; give another --out, or delete it"
+        )
+    run.mkdir(parents=True, exist_ok=True)
+    note.write_text(inputs, encoding="utf-8")
 
 
 def _calibration_inherited(output: PoseOutput, start: str) -> PoseOutput:

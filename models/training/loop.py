@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
+from models.errors import ModelError
 from models.training import optimizer as optim
 
 Model = TypeVar("Model", bound=nn.Module)
@@ -112,7 +113,19 @@ def _start_from(path: Path, model: nn.Module) -> None:
         if unset:
             raise SystemExit(f"{path} is of another architecture: it lacks {unset[:3]} ...")
     else:
-        model.load_state_dict(torch.load(path, map_location="cpu", weights_only=True)["ema"])
+        model.load_state_dict(read_checkpoint(path)["ema"])
+
+
+def read_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
+    """The state in a run's ``last.pt``, on ``device``; ``ModelError`` for any other file."""
+    try:
+        state = torch.load(path, map_location=device, weights_only=True)
+    except Exception as error:  # a reader of foreign bytes fails in every way
+        raise ModelError(f"{path} cannot be read as a training run's last.pt: {error}") from error
+    missing = {"config", "ema", "step"} - (state.keys() if isinstance(state, dict) else set())
+    if missing:
+        raise ModelError(f"{path} is not a training run's last.pt: no {', '.join(sorted(missing))}")
+    return dict(state)
 
 
 def fit(
@@ -142,7 +155,7 @@ def fit(
     step, spent_s = 0, 0.0
     last = args.out / "last.pt"
     if last.exists():
-        state: dict[str, Any] = torch.load(last, map_location=args.device, weights_only=True)
+        state = read_checkpoint(last, args.device)
         model.load_state_dict(state["model"])
         ema.load_state_dict(state["ema"])
         for o, s in zip(optimizers, state["optimizers"], strict=True):

@@ -161,8 +161,14 @@ def _columns(path: Path, category: _Category) -> dict[int, int]:
         name = re.sub(r"[\s\-]+", "_", raw.strip().lower())
         limb = _LIMB.fullmatch(name)
         joint = f"{limb[1][0]}_{limb[2]}" if limb else _HEAD.get(name)
-        if joint is not None:
-            columns[column] = LSP14.joint_names.index(joint)
+        if joint is None:
+            continue
+        index = LSP14.joint_names.index(joint)
+        if index in columns.values():
+            raise AnnotationError(
+                f"{path}: category {category.id} has two keypoints for {joint}: which is it?"
+            )
+        columns[column] = index
     limbs = {LSP14.joint_names[j] for j in columns.values()} - {"head_top", "neck"}
     missing = sorted(set(LSP14.joint_names[2:]) - limbs)
     if missing:

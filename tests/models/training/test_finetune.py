@@ -18,10 +18,17 @@ from models.card import WEIGHTS_DIR  # noqa: E402
 from models.errors import AnnotationError  # noqa: E402
 from models.person_detector import PersonBox  # noqa: E402
 from models.training import export  # noqa: E402
-from models.training.finetune import FinetuneSettings, finetune, split  # noqa: E402
+from models.training.dataset import LabelledCrop  # noqa: E402
+from models.training.finetune import (  # noqa: E402
+    FinetuneResult,
+    FinetuneSettings,
+    finetune,
+    split,
+)
 from models.training.network import ConvolutionalPoseMachine, CpmConfig  # noqa: E402
 from models.training.onnx_graph import pose_model  # noqa: E402
 from models.training.users_coco import read_coco  # noqa: E402
+from tests.models import tiny_onnx  # noqa: E402
 from tests.models.training import user_files  # noqa: E402
 
 SIZE_PX = 64
@@ -76,6 +83,43 @@ def test_human36m_by_the_command_holds_out_whole_clips(
     assert "30 people trained on, 10 held out" in result.stdout
     assert "Human3.6M, S1 (academic use only)" in (tmp_path / "out" / "studio.json").read_text()
     assert (tmp_path / "out" / "person.onnx").exists(), "the directory can be served"
+
+
+def test_a_run_goes_on_with_what_it_began_with_only(start: Path, tmp_path: Path) -> None:
+    """Whom another seed holds out may have been trained on: the figures would flatter."""
+    records = user_files.coco(tmp_path / "images", 24)
+    crops = read_coco(user_files.write(tmp_path / "l.json", records), tmp_path / "images")
+    out = tmp_path / "out"
+
+    def run(crops: list[LabelledCrop], steps: int, seed: int = 0) -> FinetuneResult:
+        settings = FinetuneSettings(steps=steps, seed=seed, hold_out=0.25, threads=1)
+        labels = {"weights_dir": start, "start": "start", "source": "drawings"}
+        return finetune(crops, out=out, name="ours", settings=settings, **labels)  # type: ignore[arg-type]
+
+    run(crops, 1)
+    assert run(crops, 2).card.measured["training_steps"] == 2
+    for others, seed in ((crops, 1), (crops[:-1], 0)):
+        with pytest.raises(ModelError, match="give another --out, or delete it"):
+            run(others, 3, seed)
+    checkpoint = out / "run" / "last.pt"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:5_000])
+    with pytest.raises(ModelError, match=r"last\.pt cannot be read as a training run's"):
+        run(crops, 3)
+
+
+def test_a_network_of_another_architecture_is_refused(tmp_path: Path) -> None:
+    weights = tmp_path / "weights"
+    tiny_onnx.write(weights, "foreign", tiny_onnx.model(tiny_onnx.planes()))
+    with pytest.raises(ModelError, match=r"foreign cannot be trained on: it has no .fine_score"):
+        finetune(
+            [],
+            weights_dir=weights,
+            start="foreign",
+            out=tmp_path / "out",
+            name="ours",
+            source="",
+            settings=FinetuneSettings(),
+        )
 
 
 def test_what_cannot_be_trained_on_is_refused(tmp_path: Path) -> None:

@@ -93,6 +93,10 @@ DAMAGE: dict[str, tuple[Callable[[Records], object], str]] = {
         lambda r: r["categories"][0].update(keypoints=[f"k{i}" for i in range(13)]),
         "lacks the keypoints l_ankle",
     ),
+    "a name twice": (
+        lambda r: r["categories"][0].update(keypoints=["l_hip", *user_files.NAMES]),
+        "two keypoints for l_hip",
+    ),
     "numbers missing": (
         lambda r: r["annotations"][0]["keypoints"].pop(),
         "annotation 0 has 38 numbers",
