@@ -214,10 +214,7 @@ class Pipeline:
         clock.lap("decode")
         boxes = self._boxes(seen, query)
         clock.lap("detect")
-        joints = self._estimator.estimate(seen.pixels_bgr, boxes) if boxes else []
-        if query.box_px is None:
-            kept = present(boxes, joints)
-            boxes, joints = [boxes[i] for i in kept], [joints[i] for i in kept]
+        boxes, joints = self._people(seen, boxes, query)
         joints = [_to_image(found, seen) for found in joints]
         clock.lap("pose")
         observations = [
@@ -306,7 +303,8 @@ class Pipeline:
     def _boxes(self, seen: Photo, query: PhotoQuery) -> list[PersonBox]:
         """The people to look at, in the decoded photo's own pixels."""
         if query.box_px is None:
-            return self._detector.detect(seen.pixels_bgr, query.max_people)
+            # Some may turn out to be nobody.
+            return self._detector.detect(seen.pixels_bgr, 2 * query.max_people)
         x, y, width, height = query.box_px
         if x >= seen.width_px or y >= seen.height_px or x + width <= 0 or y + height <= 0:
             raise InvalidInputError(
@@ -323,6 +321,20 @@ class Pipeline:
                 score=1.0,
             )
         ]
+
+    def _people(
+        self, seen: Photo, boxes: list[PersonBox], query: PhotoQuery
+    ) -> tuple[list[PersonBox], list[Joints2D]]:
+        """Whom to answer, and their joints: the first ``max_people`` boxes that show somebody."""
+        if query.box_px is not None:
+            return boxes, self._estimator.estimate(seen.pixels_bgr, boxes)
+        joints: list[Joints2D] = []
+        kept: list[int] = []
+        while len(kept) < query.max_people and len(joints) < len(boxes):
+            more = boxes[len(joints) :][: query.max_people - len(kept)]
+            joints += self._estimator.estimate(seen.pixels_bgr, more)
+            kept = present(boxes[: len(joints)], joints)
+        return [boxes[i] for i in kept], [joints[i] for i in kept]
 
 
 def _to_image(joints: Joints2D, photo: Photo) -> Joints2D:

@@ -1,0 +1,72 @@
+"""Whom the pipeline answers when some of the boxes turn out to show nobody."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from app.lifting.lifter import Lifter
+from app.lifting.types import NotLiftable
+from app.pipeline import PhotoQuery, Pipeline
+from models import Joints2D, PersonBox
+
+PHOTO = cv2.imencode(".png", np.zeros((60, 400, 3), np.uint8))[1].tobytes()
+
+
+@dataclass
+class Boxes:
+    """Detects a box at every multiple of 30 px; a pose is believed where ``real`` says so."""
+
+    real: str
+    asked: list[int] = field(default_factory=list)
+
+    def detect(self, image: NDArray[np.uint8], max_people: int) -> list[PersonBox]:
+        del image
+        many = min(max_people, len(self.real))
+        return [PersonBox(30.0 * i, 0, 20, 50, 0.9 - 0.01 * i) for i in range(many)]
+
+    def estimate(self, image: NDArray[np.uint8], boxes: Sequence[PersonBox]) -> list[Joints2D]:
+        del image
+        self.asked.append(len(boxes))
+        shape = np.random.default_rng(0).uniform(0, 20, (14, 2))
+        return [
+            Joints2D(
+                positions_px=shape + np.array([box.x_px, 0]),
+                covariance_px2=np.tile(np.eye(2), (14, 1, 1)),
+                confidence=np.full(14, 0.9 if self.real[round(box.x_px / 30)] == "x" else 0.05),
+                sigma_px=None,
+                peak=np.full(14, 0.9),
+            )
+            for box in boxes
+        ]
+
+    def lift(self, observations: Sequence[object], *_: Any, **__: Any) -> list[NotLiftable]:
+        return [NotLiftable("too few joints")] * len(observations)
+
+
+@pytest.mark.parametrize(
+    ("real", "max_people", "answered", "asked"),
+    [
+        ("x", 5, [0], [1]),
+        ("xxxx", 2, [0, 1], [2]),
+        ("-x", 1, [1], [1, 1]),
+        ("x--xx", 3, [0, 3, 4], [3, 2]),
+        ("---x", 1, [], [1, 1]),  # no more than twice as many boxes are looked at
+        ("", 5, [], []),
+    ],
+)
+def test_a_box_that_shows_nobody_leaves_its_place_to_the_next(
+    real: str, max_people: int, answered: list[int], asked: list[int]
+) -> None:
+    boxes = Boxes(real)
+    lifter = cast("Lifter", boxes)
+    pipeline = Pipeline(boxes, boxes, lifter, max_pixels=10**6, decode_side_px=448)
+    result = pipeline.estimate(PHOTO, PhotoQuery(max_people=max_people))
+    assert [round(person.box_px[0] / 30) for person in result.people] == answered
+    assert boxes.asked == asked
