@@ -58,10 +58,10 @@ class AsyncClient:
 
     async def wait_until_ready(self) -> None:
         """Return as soon as photos can be sent; an error when the deadline passes before."""
-        await self._ask(calls.readiness())
+        await self._ask(calls.readiness(), self._retries.until_deadline())
 
-    async def _ask(self, call: Call) -> object:
-        attempts = Attempts(self._retries)
+    async def _ask(self, call: Call, retries: Retries | None = None) -> object:
+        attempts = Attempts(retries or self._retries)
         while True:
             try:
                 response = await self._http.request(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import random
+import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 
@@ -14,6 +15,8 @@ import httpx
 from posematch_client.errors import RefusedError, UnreachableError
 
 RETRIED_STATUSES = frozenset({429, 502, 503, 504})
+_DOUBLINGS = 100
+"""Of the pause at most: no number holds a thousand."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,10 @@ class Retries:
     def __post_init__(self) -> None:
         if self.deadline_s <= 0 or self.attempts < 1:
             raise ValueError("deadline_s must be positive and attempts at least 1")
+
+    def until_deadline(self) -> Retries:
+        """The same with only the deadline as an end."""
+        return replace(self, attempts=sys.maxsize)
 
 
 class Attempts:
@@ -78,7 +85,7 @@ class Attempts:
     def _pause(self, asked_s: float | None) -> float | None:
         self._made += 1
         if asked_s is None:
-            doubled = self._retries.first_pause_s * 2.0 ** (self._made - 1)
+            doubled = self._retries.first_pause_s * 2.0 ** min(self._made - 1, _DOUBLINGS)
             pause = self._uniform(0.0, min(doubled, self._retries.longest_pause_s))
         else:
             pause = asked_s + self._uniform(0.0, max(asked_s, 1.0) / 4)

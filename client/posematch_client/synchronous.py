@@ -66,10 +66,10 @@ class Client:
 
     def wait_until_ready(self) -> None:
         """Return as soon as photos can be sent; an error when the deadline passes before."""
-        self._ask(calls.readiness())
+        self._ask(calls.readiness(), self._retries.until_deadline())
 
-    def _ask(self, call: Call) -> object:
-        attempts = Attempts(self._retries)
+    def _ask(self, call: Call, retries: Retries | None = None) -> object:
+        attempts = Attempts(retries or self._retries)
         while True:
             try:
                 response = self._http.request(

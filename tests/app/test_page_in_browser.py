@@ -284,7 +284,8 @@ def test_options_are_sent_and_checked(browser: Browser, server: Server) -> None:
 
 def test_the_curl_command_gives_the_same(browser: Browser, server: Server) -> None:
     with Visit(browser, server) as page:
-        upload(page, "it's me.jpg", (RENDERS / "006.jpg").read_bytes())
+        kind = "image/jpeg; of='a b'"
+        upload(page, "it's me.jpg", (RENDERS / "006.jpg").read_bytes(), kind)
         people = answered(page)["people"]
         command = page.locator("#curl").text_content() or ""
     assert "'it'\\''s me.jpg'" in command

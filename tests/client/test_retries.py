@@ -190,3 +190,29 @@ def test_senseless_patience() -> None:
         with pytest.raises(ValueError, match="attempts"):
             Retries(**bad)
     assert 408 not in RETRIED_STATUSES
+
+
+@pytest.mark.parametrize("way", ["sync", "async"])
+def test_readiness_is_waited_for_until_the_deadline(way: str) -> None:
+    """However many tries other calls have: a first start takes minutes."""
+    script = Script(*[refusal(503) for _ in range(5)])
+    transport = httpx.MockTransport(script)
+    once = Retries(deadline_s=5.0, attempts=1, first_pause_s=0.001, longest_pause_s=0.002)
+    if way == "sync":
+        with Client(URL, retries=once, transport=transport) as client:
+            client.wait_until_ready()
+    else:
+
+        async def wait() -> None:
+            async with AsyncClient(URL, retries=once, transport=transport) as client:
+                await client.wait_until_ready()
+
+        anyio.run(wait)
+    assert len(script.requests) == 6
+
+
+def test_pauses_stay_numbers_however_many_tries() -> None:
+    clock = Clock()
+    attempts = Attempts(Retries(deadline_s=1e9).until_deadline(), clock, lambda _, most: most)
+    pauses = [attempts.pause_after(refusal(502)) for _ in range(1100)]
+    assert pauses[-1] == Retries().longest_pause_s

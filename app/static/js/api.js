@@ -76,7 +76,7 @@ export function curlCommand(fileName, mediaType, query, hasKey) {
   const parts = [
     "curl -s",
     `--data-binary @${quoted(fileName)}`,
-    `-H 'Content-Type: ${mediaType}'`,
+    `-H ${quoted(`Content-Type: ${mediaType}`)}`,
     ...(hasKey ? ['-H "X-API-Key: $POSEMATCH_KEY"'] : []),
     quoted(url.href),
   ];
