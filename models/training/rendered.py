@@ -2,8 +2,8 @@
 
 Photos with exact labels are rare, and rarest for people seen from behind, bent, lying or upside
 down. This program poses a CC0 body after mocap, dresses it, lights it, and puts it before patches
-of photos; the labels are the skeleton's own projections. Each crop depends on the seed and its
-number alone, so that a set can be made in parts and made again.
+of photos; the labels are the skeleton's own projections, and the truth in 3D is beside them. Each
+crop depends on the seed and its number alone, so that a set can be made in parts and made again.
 """
 
 from __future__ import annotations
@@ -53,6 +53,9 @@ def make_entry(studio: Studio, seed: int, number: int) -> Entry:
         "image": f"r{number:05d}.jpg",
         "size_px": size,
         "joints_px": np.round(crop.joints_px.astype(float), 2).tolist(),
+        "joints_mm": np.round(crop.joints_mm.astype(float), 1).tolist(),
+        "focal_length_px": round(crop.focal_length_px, 3),
+        "principal_point_px": np.round(crop.principal_point_px.astype(float), 3).tolist(),
         "labelled": [1] * LSP14.n_joints,
         "visible": crop.visible.astype(int).tolist(),
         "wild": False,

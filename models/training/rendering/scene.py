@@ -34,11 +34,15 @@ class Crop:
     """A rendered crop.
 
     ``image`` (s, s, 3) uint8 BGR, ``joints_px`` (14, 2), ``visible`` (14,), ``mask`` (s, s) the
-    share of each pixel that the person covers.
+    share of each pixel that the person covers. ``joints_mm`` (14, 3) in the camera's frame;
+    ``focal_length_px`` and ``principal_point_px`` (2,) are the camera's, in pixels of the crop.
     """
 
     image: Image
     joints_px: Floats
+    joints_mm: Floats
+    focal_length_px: float
+    principal_point_px: Floats
     visible: NDArray[np.bool_]
     mask: Floats
 
@@ -130,13 +134,21 @@ class Studio:
         joints_big = star.joints[:, :2] / star.joints[:, 2:] * focal + offset
         visible = _visible(star.joints, joints_big, seen, big)
         image, hidden = _finish(rng, canvas, self._photos, size)
-        joints_px = ((joints_big + 0.5) / OVERSAMPLE - 0.5).astype(np.float32)
+        joints_px = _reduced(joints_big)
         if hidden is not None:
             x0, y0, x1, y1 = hidden
             under = (joints_px >= (x0 - 0.5, y0 - 0.5)).all(1)
             under &= (joints_px <= (x1 - 0.5, y1 - 0.5)).all(1)
             visible &= ~under
-        return Crop(image, joints_px, visible, _resized(mask.reshape(big, big), size))
+        return Crop(
+            image=image,
+            joints_px=joints_px,
+            joints_mm=1000 * star.joints,
+            focal_length_px=focal / OVERSAMPLE,
+            principal_point_px=_reduced(offset),
+            visible=visible,
+            mask=_resized(mask.reshape(big, big), size),
+        )
 
     def _actor(self, rng: np.random.Generator, rotation: Floats, at: NDArray[np.float64]) -> _Actor:
         shape, rest = self._cast[rng.integers(len(self._cast))]
@@ -154,6 +166,12 @@ class Studio:
             self._model.kind[keep],
             look,
         )
+
+
+def _reduced(points: NDArray[np.floating]) -> Floats:
+    """Pixels of the oversampled picture -> of the crop."""
+    result: Floats = ((points + 0.5) / OVERSAMPLE - 0.5).astype(np.float32)
+    return result
 
 
 def _resized(plane: Floats, size: int) -> Floats:

@@ -174,6 +174,15 @@ def test_labels_lie_on_the_person_and_fill_the_crop(studio: Studio) -> None:
         assert outside.sum() == 0
 
 
+def test_the_camera_sees_the_joints_where_the_labels_are(studio: Studio) -> None:
+    for seed in range(3):
+        record = make_entry(studio, 6, seed).record
+        joints, focal = np.array(record["joints_mm"]), record["focal_length_px"]
+        assert 500 < np.ptp(joints, axis=0).max() < 2500, "millimetres"
+        seen = focal * joints[:, :2] / joints[:, 2:] + record["principal_point_px"]
+        np.testing.assert_allclose(seen, record["joints_px"], atol=0.03)
+
+
 def test_a_crop_is_its_seed_s_and_number_s_and_comes_back_from_the_tar(
     studio: Studio, tmp_path: Path
 ) -> None:
