@@ -289,6 +289,7 @@ def test_the_curl_command_gives_the_same(browser: Browser, server: Server) -> No
         people = answered(page)["people"]
         command = page.locator("#curl").text_content() or ""
     assert "'it'\\''s me.jpg'" in command
+    assert "of='\\''a b'\\'''" in command
     command = command.replace("'it'\\''s me.jpg'", "006.jpg")
     done = subprocess.run(
         ["bash", "-c", command], cwd=RENDERS, capture_output=True, check=True, timeout=60
