@@ -66,8 +66,10 @@ class PoseLifter:
             present: (14,) 0 = missing, whose point is ignored; two joints at least.
 
         """
-        seen = present > 0
-        joints = np.concatenate([np.where(seen[:, None], points, 0.0), seen[:, None]], axis=1)
-        answer = self._model.run(joints[None].astype(np.float32))[0].astype(np.float64)
+        seen = (present > 0)[:, None]
+        joints = np.empty((1, LSP14.n_joints, 3), np.float32)
+        joints[0, :, :2] = np.where(seen, points, 0.0)
+        joints[0, :, 2:] = seen
+        answer = self._model.run(joints)[0].astype(np.float64)
         n = 2 * LSP14.n_joints
         return LearnedPose(answer[0, :n].reshape(-1, 2), answer[0, n:], answer[1:])

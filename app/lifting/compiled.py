@@ -31,7 +31,8 @@ def compiled() -> ctypes.CDLL:
     library.posematch_resect.restype = None
     library.posematch_place.argtypes = [
         *(number, number, array, array, array, array),
-        *(number, number, array, number, number, real, real, real, array, array),
+        *(number, number, array, number, number, real, real, real),
+        *(number, array, array, array, array, array),
     ]
     library.posematch_place.restype = real
     library.posematch_local_prior.argtypes = [

@@ -26,17 +26,38 @@ void invert(std::vector<double>& matrix, int64_t n) {
     }
 }
 
+double mean_stature(int64_t n, int64_t n_joints, const double* poses, int64_t n_segments,
+                    const double* segments, const double* shares) {
+    double total = 0.0;
+    for (int64_t s = 0; s < n_segments; ++s)
+        for (int64_t k = 0; k < n; ++k) {
+            double length[3] = {};
+            for (int64_t j = 0; j < n_joints; ++j) {
+                const double share = segments[s * n_joints + j];
+                if (share == 0.0) continue;
+                const double* joint = poses + 3 * (k * n_joints + j);
+                for (int i = 0; i < 3; ++i) length[i] += share * joint[i];
+            }
+            total += shares[s] * std::sqrt(length[0] * length[0] + length[1] * length[1] +
+                                           length[2] * length[2]);
+        }
+    return total / n;
+}
+
 }  // namespace
 
 // States (n + 1 + D, 3 J) and root depths (n + 1 + D,) of n exemplars (n, J, 3) with rotations
 // (n, 3, 3); of the mean of the first `n_typical`; and of that mean changed along each of D
-// directions (D, J, J). Returns the standard pixels in a normalised unit.
+// directions (D, J, J). Also the exemplars' mean stature, a sum of segments (S, J), times joints, in
+// `shares` (S,). Returns the standard pixels in a normalised unit.
 extern "C" double posematch_place(int64_t n, int64_t n_joints, const double* exemplars,
                                   const double* rotations, const double* points,
                                   const double* weights, int64_t n_typical, int64_t n_directions,
                                   const double* directions, int64_t right_hip, int64_t left_hip,
                                   double nearest_to_extent, double least_extent, double px_per_mm,
-                                  double* states, double* root_depth) {
+                                  int64_t n_segments, const double* segments,
+                                  const double* shares, double* stature, double* states,
+                                  double* root_depth) {
     const posematch::Translation translation(n_joints, points, weights,
                                              {nearest_to_extent, least_extent});
     const int64_t size = 3 * n_joints, all = n + 1 + n_directions;
@@ -69,6 +90,7 @@ extern "C" double posematch_place(int64_t n, int64_t n_joints, const double* exe
     std::vector<double> depths(root_depth, root_depth + n);
     std::nth_element(depths.begin(), depths.begin() + n / 2, depths.end());
     const double px_per_unit = px_per_mm * depths[n / 2];
+    *stature = mean_stature(n, n_joints, exemplars, n_segments, segments, shares);
     for (int64_t k = 0; k < all; ++k) {
         const double* pose = &posed[k * size];
         double* state = states + k * size;

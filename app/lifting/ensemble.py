@@ -23,7 +23,7 @@ from app.lifting.geometry import Floats, Integers
 from app.lifting.posterior import STANDARD_PX_PER_MM
 from app.lifting.proportions import PROPORTION_DIRECTIONS
 from app.lifting.resection import LEAST_EXTENT_MM, NEAREST_TO_EXTENT
-from app.lifting.stature import stature_mm
+from app.lifting.stature import STATURE_SEGMENTS, STATURE_SHARES
 from library_store.skeleton import L_HIP, LSP14, R_HIP, Skeleton
 
 _TYPICAL = 16
@@ -89,7 +89,7 @@ def place_ensemble(
     ):
         raise ValueError("exemplars, rotations, points and weights do not belong together")
     states = np.empty((n + 1 + len(directions), 3 * n_joints))
-    root_depth = np.empty(len(states))
+    root_depth, stature = np.empty(len(states)), np.empty(1)
     px_per_unit = compiled().posematch_place(
         n,
         n_joints,
@@ -105,6 +105,10 @@ def place_ensemble(
         NEAREST_TO_EXTENT,
         LEAST_EXTENT_MM,
         STANDARD_PX_PER_MM,
+        len(STATURE_SEGMENTS),
+        STATURE_SEGMENTS.ctypes.data,
+        STATURE_SHARES.ctypes.data,
+        stature.ctypes.data,
         states.ctypes.data,
         root_depth.ctypes.data,
     )
@@ -113,7 +117,7 @@ def place_ensemble(
         root_depth_mm=root_depth[:n],
         proportions=states[n + 1 :] - states[n],
         px_per_unit=px_per_unit,
-        stature_mm=float(stature_mm(exemplars_mm).mean()),
+        stature_mm=float(stature[0]),
     )
 
 

@@ -54,13 +54,12 @@ def misplaced(
         suspect: the joint that contradicts the neighbours, if any.
 
     """
-    seen = np.flatnonzero(confidence > 0)
-    apart = px_per_unit * np.sqrt(((learned.points - points)[seen] ** 2).sum(1))
-    worst = int(np.argmax(apart))
-    usual = float(np.sort(apart)[len(apart) // 2]) + _CLOSE_PX
-    found = int(seen[worst])
+    apart = px_per_unit * np.sqrt(((learned.points - points) ** 2).sum(1))
+    seen = apart[confidence > 0]
+    usual = float(np.sort(seen)[len(seen) // 2]) + _CLOSE_PX
+    found = int(np.argmax(np.where(confidence > 0, apart, -1.0)))
     far = _ASTRAY if found == suspect else _FAR_ASTRAY
-    return found if apart[worst] > far * usual else None
+    return found if apart[found] > far * usual else None
 
 
 def with_learned(

@@ -38,6 +38,7 @@ MIN_JOINTS = 6
 MIN_TRUNK_JOINTS = 2
 """Of shoulders, hips and neck: without them limbs hang on nothing."""
 TRUNK = (NECK, R_SHOULDER, L_SHOULDER, R_HIP, L_HIP)
+_TRUNK_JOINTS = np.array(TRUNK)
 MIN_EXTENT_PX = 8.0
 """Larger side of the joints' bounding box, pixels of the photo."""
 MIN_BREADTH = 0.02
@@ -359,18 +360,22 @@ def _no_lap(_: str) -> None:
 def _why_not_liftable(joints_px: Floats, confidence: Floats) -> str | None:
     """Why joints of these confidences do not determine a pose, or None if they do."""
     present = confidence > 0
-    if present.sum() < MIN_JOINTS:
-        return f"{int(present.sum())} joints are visible; at least {MIN_JOINTS} are needed"
-    if present[list(TRUNK)].sum() < MIN_TRUNK_JOINTS:
+    n = int(np.count_nonzero(present))
+    if n < MIN_JOINTS:
+        return f"{n} joints are visible; at least {MIN_JOINTS} are needed"
+    if np.count_nonzero(present[_TRUNK_JOINTS]) < MIN_TRUNK_JOINTS:
         return (
             f"fewer than {MIN_TRUNK_JOINTS} of neck, shoulders and hips are visible: "
             "limbs alone do not place a body"
         )
-    if np.ptp(joints_px[present], axis=0).max() < MIN_EXTENT_PX:
+    seen = joints_px[present]
+    if (seen.max(axis=0) - seen.min(axis=0)).max() < MIN_EXTENT_PX:
         return f"the joints lie within {MIN_EXTENT_PX:g} pixels of each other"
-    centred = joints_px[present] - joints_px[present].mean(axis=0)
-    along, across = np.linalg.svd(centred, compute_uv=False)
-    if across < MIN_BREADTH * along:
+    centred = seen - seen.sum(axis=0) / n
+    # Of the scatter, whose eigenvalues are along² and across².
+    (xx, xy), (_, yy) = (centred.T @ centred).tolist()
+    along2 = 0.5 * (xx + yy + math.hypot(xx - yy, 2.0 * xy))
+    if xx * yy - xy * xy < (MIN_BREADTH * along2) ** 2:
         return "the joints lie on one line: nobody is seen as thin as that"
     return None
 
@@ -383,6 +388,6 @@ def _why_not_seen(view: CentredView) -> str | None:
         return (
             f"the person is more than {MAX_OFF_AXIS_DEG:g} degrees off the optical axis; {remedy}"
         )
-    if np.linalg.norm(view.points, axis=1).max() > math.tan(math.radians(MAX_SPREAD_DEG)):
+    if (view.points**2).sum(1).max() > math.tan(math.radians(MAX_SPREAD_DEG)) ** 2:
         return f"the joints span more than {MAX_SPREAD_DEG:g} degrees from their centre; {remedy}"
     return None
