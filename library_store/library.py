@@ -158,16 +158,19 @@ class Library:
         if k < 1:
             raise ValueError(f"k must be positive, not {k}")
         k = min(k, len(self))
+        shares = np.ones(points.shape[:2]) if weights is None else np.asarray(weights, np.float64)
+        least = shares.min(axis=1)
+        complete = (least > 0) & (least == shares.max(axis=1))
+        if complete.all():
+            found = self._index.query(describe(points), k)
+            return Matches(entries=found.entries, distances=found.distances)
         entries = np.empty((len(points), k), dtype=np.int64)
         distances = np.empty((len(points), k))
-        shares = np.ones(points.shape[:2]) if weights is None else np.asarray(weights, np.float64)
-        complete = (shares > 0).all(axis=1) & (np.ptp(shares, axis=1) == 0)
         if complete.any():
             found = self._index.query(describe(points[complete]), k)
             entries[complete], distances[complete] = found.entries, found.distances
-        if not complete.all():
-            found = self._index.query_masked(points[~complete], shares[~complete], k)
-            entries[~complete], distances[~complete] = found.entries, found.distances
+        found = self._index.query_masked(points[~complete], shares[~complete], k)
+        entries[~complete], distances[~complete] = found.entries, found.distances
         return Matches(entries=entries, distances=distances)
 
     def source(self, entry: int) -> Source:

@@ -71,11 +71,10 @@ def nearest_of(table: Descriptors, entries: Entries, descriptor: Descriptors, k:
 
     ``entries`` (n,) are those of the rows of ``table`` (n, 28). Neighbours of (k,).
     """
-    order = np.argsort(entries)
-    difference = np.subtract(table[order], descriptor, dtype=np.float64)
+    difference = table.astype(np.float64) - descriptor
     distances = np.sqrt(np.einsum("nd,nd->n", difference, difference))
-    best = np.argsort(distances, kind="stable")[:k]
-    return Neighbours(entries=entries[order][best], distances=distances[best])
+    best = np.lexsort((entries, distances))[:k]
+    return Neighbours(entries=entries[best], distances=distances[best])
 
 
 def largest(values: NDArray[np.float32], n: int) -> Entries:
