@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from library_store.skeleton import L_HIP, L_SHOULDER, LSP14, R_HIP, R_SHOULDER
+from library_store.skeleton import LSP14
 from models.training.cutout import over, place, silhouette, whole
-from models.training.dataset import Image, LabelledCrop
+from models.training.dataset import TORSO, Image, LabelledCrop
 
 MIRROR = np.array(LSP14.mirror)
 CROP_SCALE = 1.25
@@ -21,7 +21,6 @@ gets. The others teach the first look, which meets people as they are."""
 UPRIGHT_SPREAD_DEG = 15.0
 COMPANY_SHARE = 0.25
 """Of the views that get a second person, close by, before or behind the one they are about."""
-TORSO = [R_SHOULDER, L_SHOULDER, R_HIP, L_HIP]
 
 
 @dataclass(frozen=True)
@@ -151,8 +150,9 @@ def in_company(crop: LabelledCrop, other: LabelledCrop, rng: np.random.Generator
 
 def _random_turn(crop: LabelledCrop, rng: np.random.Generator) -> float:
     """Angle (rad) to turn the image by, clockwise as seen."""
-    if rng.random() < UPRIGHT_SHARE and (crop.weight[TORSO] > 0).all():
-        shoulders, hips = crop.joints_px[TORSO[:2]].mean(0), crop.joints_px[TORSO[2:]].mean(0)
+    if rng.random() < UPRIGHT_SHARE and crop.has_torso:
+        torso = crop.joints_px[list(TORSO)]
+        shoulders, hips = torso[:2].mean(0), torso[2:].mean(0)
         right, down = (float(v) for v in shoulders - hips)
         return float(np.deg2rad(rng.normal(0, UPRIGHT_SPREAD_DEG)) - np.arctan2(right, -down))
     if rng.random() < (0.25 if crop.wild else 0.08):

@@ -35,6 +35,8 @@ MP33_LIMBS = (12, 14, 16, 11, 13, 15, 24, 26, 28, 23, 25, 27)
 Image = NDArray[Any]
 """(h, w, 3) uint8 BGR; OpenCV's type stubs promise less."""
 
+TORSO = (R_SHOULDER, L_SHOULDER, R_HIP, L_HIP)
+
 HOLD_OUT_ONE_IN = 7
 DEV_LABELLED = 200
 """Labelled crops of each training file kept aside to choose by; lspet_val is only reported."""
@@ -64,6 +66,11 @@ class LabelledCrop:
         known = self.joints_px[self.weight > 0]
         low, high = known.min(0), known.max(0)
         return (low + high) / 2, float((high - low).max())
+
+    @property
+    def has_torso(self) -> bool:
+        """Shoulders and hips are labelled: without them there is no length to measure errors by."""
+        return bool((self.weight[list(TORSO)] > 0).all())
 
 
 def _members(path: Path) -> Iterator[tuple[str, bytes]]:
@@ -199,7 +206,7 @@ def held_out(crop: LabelledCrop) -> bool:
 def read_crops(
     folder: Path, train: str, test: str
 ) -> tuple[list[LabelledCrop], dict[str, list[LabelledCrop]]]:
-    """Training crops, and the held-out ones by name.
+    """Training crops, and by name the held-out ones that errors can be measured on.
 
     Comma-separated names of tars in ``folder``, or paths, without ".tar"; ``name*2`` is drawn
     twice as often. Files called rendered* are trained on whole but for a few.
@@ -210,7 +217,7 @@ def read_crops(
         name, _, times = item.partition("*")
         loaded = load(folder / f"{name}.tar")
         if name.startswith("lspet"):
-            kept["labelled_dev"] += loaded[-DEV_LABELLED:]
+            kept["labelled_dev"] += [c for c in loaded[-DEV_LABELLED:] if c.has_torso]
             used = loaded[:-DEV_LABELLED]
         elif Path(name).name.startswith("rendered"):
             kept.setdefault("rendered_dev", []).extend(loaded[-DEV_RENDERED:])

@@ -31,8 +31,6 @@ from models.training.objective import total_loss
 from models.training.onnx_graph import pose_model
 from models.training.train import measure, to_batch
 
-TORSO = (2, 5, 8, 11)
-"""Without shoulders and hips there is no torso to measure errors by."""
 LEAST_HELD, LEAST_TRAINED = 5, 20
 BATCH_MOST = 32
 
@@ -70,7 +68,7 @@ def split(
     groups = sorted({crop.group for crop in crops})
     order = sorted(groups, key=lambda g: zlib.crc32(f"{seed}/{g}".encode()))
     kept = set(order[: max(1, round(share * len(groups)))])
-    held = [c for c in crops if c.group in kept and (c.weight[list(TORSO)] > 0).all()]
+    held = [c for c in crops if c.group in kept and c.has_torso]
     train = [c for c in crops if c.group not in kept]
     if len(held) < LEAST_HELD or len(train) < LEAST_TRAINED:
         raise AnnotationError(

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from library_store.skeleton import LSP14
+from library_store.skeleton import LSP14, R_HIP
 from models.training.augment import MIRROR, canonical, crop_matrix, random_view
 from models.training.dataset import (
     DEV_LABELLED,
@@ -49,9 +49,14 @@ def test_labels_are_read_and_hardly_labelled_crops_left_out(tmp_path: Path) -> N
     assert crops[0].weight[-1] == 0
 
 
-def _tar(path: Path, count: int, joints: list[list[float]]) -> None:
+def _tar(path: Path, count: int, joints: list[list[float]], no_torso: int = -1) -> None:
+    """Crops, one of them (``no_torso``) with a hip that nobody labelled."""
     records = [
-        {"image": f"{path.stem}{i}.jpg", "joints_px": joints, "labelled": [1] * 14}
+        {
+            "image": f"{path.stem}{i}.jpg",
+            "joints_px": joints,
+            "labelled": [int(i != no_torso or joint != R_HIP) for joint in range(14)],
+        }
         for i in range(count)
     ]
     _, jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))
@@ -79,6 +84,15 @@ def test_a_starred_file_is_drawn_more_often_and_what_is_kept_aside_is_not_traine
     aside = {c.name for crops_kept in kept.values() for c in crops_kept}
     assert len(aside) == DEV_LABELLED + DEV_RENDERED
     assert not aside & set(names)
+
+
+def test_errors_are_not_measured_by_a_torso_that_nobody_labelled(tmp_path: Path) -> None:
+    joints = np.arange(28.0).reshape(14, 2).tolist()
+    _tar(tmp_path / "lspet_x.tar", DEV_LABELLED + 3, joints, no_torso=10)
+    crops, kept = read_crops(tmp_path, "lspet_x", "")
+    names = {c.name for c in kept["labelled_dev"]}
+    assert len(names) == DEV_LABELLED - 1
+    assert "lspet_x10.jpg" not in names | {c.name for c in crops}
 
 
 def test_a_photo_is_held_out_whole_and_always_the_same_ones() -> None:
