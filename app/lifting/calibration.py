@@ -1,15 +1,22 @@
 """From the spread of the fused posterior to a radius one can rely on.
 
-Per joint, ``sigma_mm = factor_j · sqrt(spread² + (noise_mm_per_px · ν)²)``, with ν the noise found
-in the 2D joints, is the radius that held 68% of the root-relative errors of people the library was
-not fitted on; ``evaluation.calibration`` refits it.
+Per joint, ``sigma_mm = factor_j · sqrt(spread² + (a·ν)² + (b·d)² + (c·d_j)²)`` with a, b and c the
+constants ``noise_mm_per_px``, ``person_doubt_mm`` and ``joint_doubt_mm``; ν the noise found in the
+2D joints; d_j = 1 - confidence, the chance that a seen joint is elsewhere (0 for a missing one: it
+says nothing, and the spread knows), and d its mean over the seen joints. The spread answers for
+noise; a left leg taken for the right one is no noise, and joints of exchanged sides fit a pose, of
+somebody who faces the other way. What tells of it is the network's own confidence.
 
-What the constants here rest on: 750 people of five mocap subjects, all joints seen, at 0, 5 and 10
-px of noise together, lifted with a library and a lifting network fitted without these subjects. On
-750 other people *of the same five subjects* the radius covers 72%, 66% and 67% at the three noise
-levels. It knows nothing of body size, which a photo does not show, and covers less of people of
-another build (docs/accuracy.md). Without the network (``POSEMATCH_LIFTER=off``) it was not
-calibrated; nor for a given subject height, which scales the radius with the answer.
+Factors and a (``evaluation.calibration`` refits them): the radius held 68% of the root-relative
+errors of 750 people of five mocap subjects, all joints seen and sure, at 0, 5 and 10 px of noise
+together, lifted with a library and a lifting network fitted without these subjects. On 750 other
+people *of the same five subjects* it covers 72%, 66% and 67% at the three noise levels. It knows
+nothing of body size, which a photo does not show, and covers less of people of another build
+(docs/accuracy.md). Without the network (``POSEMATCH_LIFTER=off``) it was not calibrated; nor for a
+given subject height, which scales the radius with the answer.
+
+b and c (``evaluation.photo_sigma``): 600 rendered people in poses of the same subjects, turned and
+tumbled, their joints found by the shipped CPM. On 600 others it covers 68%; 26% without b and c.
 """
 
 from __future__ import annotations
@@ -23,15 +30,34 @@ from app.lifting.geometry import Floats
 
 @dataclass(frozen=True)
 class SigmaCalibration:
-    """``factors`` (14,) and ``noise_mm_per_px``: see the module."""
+    """``factors`` (14,) and the constants in mm: see the module."""
 
     factors: tuple[float, ...]
     noise_mm_per_px: float
+    person_doubt_mm: float = 0.0
+    joint_doubt_mm: float = 0.0
 
-    def __call__(self, spread_mm: Floats, noise_px: Floats | float) -> Floats:
-        """Posterior spread (..., 14) mm and noise (...) standard px -> 68% radius (..., 14) mm."""
+    def __call__(
+        self, spread_mm: Floats, noise_px: Floats | float, confidence: Floats | None = None
+    ) -> Floats:
+        """The 68% radius (..., 14) mm.
+
+        Args:
+            spread_mm: (..., 14) posterior spread.
+            noise_px: (...) noise found, standard pixels.
+            confidence: (..., 14) the chance that a joint is where it was seen, 0 for missing ones;
+                None when all are sure.
+
+        """
         noise_mm = self.noise_mm_per_px * np.asarray(noise_px)[..., None]
-        return np.array(self.factors) * np.sqrt(spread_mm**2 + noise_mm**2)
+        variance = spread_mm**2 + noise_mm**2
+        if confidence is not None:
+            seen = confidence > 0
+            doubt = np.where(seen, 1.0 - confidence, 0.0)
+            of_person = doubt.sum(-1, keepdims=True) / np.maximum(seen.sum(-1, keepdims=True), 1)
+            variance = variance + (self.person_doubt_mm * of_person) ** 2
+            variance = variance + (self.joint_doubt_mm * doubt) ** 2
+        return np.array(self.factors) * np.sqrt(variance)
 
 
 FUSION_SIGMA = SigmaCalibration(
@@ -40,4 +66,6 @@ FUSION_SIGMA = SigmaCalibration(
         1.211, 0.678, 1.107, 1.111, 0.677, 1.061, 1.083,
     ),
     noise_mm_per_px=4.0,
+    person_doubt_mm=700.0,
+    joint_doubt_mm=600.0,
 )  # fmt: skip

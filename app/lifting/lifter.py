@@ -215,7 +215,9 @@ class Lifter:
         else:
             warped, answer = warp_perspective(best, view.points, present), fused.joints_mm
             noise_px = fused.noise_px
-            sigma = settings.sigma(fused.spread_mm, noise_px) if settings.sigma else None
+            sigma = None
+            if settings.sigma:
+                sigma = settings.sigma(fused.spread_mm, noise_px, confidence)
         answer, warped = view.to_photo(answer), view.to_photo(warped)
         if not (answer[:, 2] > 0).all():
             return NotLiftable(

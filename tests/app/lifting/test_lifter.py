@@ -329,3 +329,13 @@ def test_lifting_is_pinhole_consistent_at_any_focal(lifter: Lifter, people: Peop
         person = lift_one(lifter, people.observation(6), camera)
         back = project(person.warped_mm, focal_px, np.array(camera.principal_point_px))
         np.testing.assert_allclose(back, people.joints_px[6], atol=1e-9)
+
+
+def test_who_was_seen_with_doubt_is_answered_with_doubt(lifter: Lifter, people: People) -> None:
+    """The joints may be those of an exchanged leg, which no spread about them tells."""
+    sure = lift_one(lifter, people.observation(5))
+    seen = people.observation(5)
+    unsure = lift_one(lifter, replace(seen, confidence=np.full(14, 0.7)))
+    assert sure.sigma_mm is not None
+    assert unsure.sigma_mm is not None
+    assert (unsure.sigma_mm > sure.sigma_mm + 50).all()

@@ -1,0 +1,47 @@
+"""From posterior spread to sigma_mm: invariants of the radius."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from app.lifting.calibration import FUSION_SIGMA, SigmaCalibration
+
+PLAIN = SigmaCalibration((1.0,) * 14, 0.0, person_doubt_mm=300.0, joint_doubt_mm=400.0)
+SPREAD_MM = np.full(14, 50.0)
+SURE = np.ones(14)
+
+
+def test_sure_joints_add_nothing() -> None:
+    exact = FUSION_SIGMA(SPREAD_MM, 3.0)
+    np.testing.assert_array_equal(FUSION_SIGMA(SPREAD_MM, 3.0, SURE), exact)
+
+
+def test_a_doubtful_joint_widens_its_own_radius_most_and_everybody_s_a_little() -> None:
+    confidence = SURE.copy()
+    confidence[4] = 0.3
+    radius = PLAIN(SPREAD_MM, 0.0, confidence)
+    others = np.delete(radius, 4)
+    np.testing.assert_allclose(others, np.hypot(50.0, 300.0 * 0.7 / 14))
+    assert radius[4] == pytest.approx(np.sqrt(50.0**2 + (300.0 * 0.7 / 14) ** 2 + 280.0**2))
+
+
+def test_missing_joints_are_no_doubtful_ones() -> None:
+    """What is not seen contradicts nobody: the posterior's spread knows of it."""
+    confidence = SURE.copy()
+    confidence[[4, 7]] = 0.0
+    np.testing.assert_array_equal(PLAIN(SPREAD_MM, 0.0, confidence), SPREAD_MM)
+    confidence[3] = 0.4
+    np.testing.assert_allclose(
+        PLAIN(SPREAD_MM, 0.0, confidence)[4], np.hypot(50.0, 300.0 * 0.6 / 12)
+    )
+
+
+def test_people_do_not_mix() -> None:
+    rng = np.random.default_rng(0)
+    spread, noise = rng.uniform(20, 200, (5, 14)), rng.uniform(0, 9, 5)
+    confidence = rng.uniform(0.2, 1, (5, 14))
+    together = FUSION_SIGMA(spread, noise, confidence)
+    for i in range(5):
+        alone = FUSION_SIGMA(spread[i], noise[i], confidence[i])
+        np.testing.assert_allclose(together[i], alone, rtol=1e-12)

@@ -1,0 +1,75 @@
+"""What the network's doubt adds to sigma_mm: the fit, and the command on photos with truth."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.lifting.calibration import SigmaCalibration
+from evaluation import photo_sigma
+from evaluation.photo_sigma import Answers, fit_doubts
+from library_store.build import BuildSettings, build_library
+from library_store.prior import PosePrior
+
+RENDERS = Path(__file__).parents[1] / "data" / "renders"
+
+
+def made_up(people: int) -> tuple[Answers, SigmaCalibration]:
+    """Answers whose errors a known calibration covers by 68%."""
+    rng = np.random.default_rng(4)
+    shape = (people, 14)
+    truth = SigmaCalibration((1.0,) * 14, 0.0, person_doubt_mm=600.0, joint_doubt_mm=300.0)
+    confidence = 1 - rng.uniform(0, 0.5, (people, 1)) * rng.uniform(0, 1, shape)
+    answers = Answers(rng.uniform(30, 90, shape), np.zeros(shape), confidence, np.zeros(people))
+    # |N(0, 1)| is below 0.994 in 68% of draws.
+    error = np.abs(rng.normal(size=shape)) / 0.9945 * answers.sigma_mm(truth)
+    return replace(answers, error_mm=error), truth
+
+
+def test_the_fit_finds_what_the_doubts_are_worth() -> None:
+    answers, truth = made_up(3000)
+    alone = replace(truth, person_doubt_mm=0.0, joint_doubt_mm=0.0)
+    fitted = fit_doubts(answers, alone)
+    assert abs(fitted.person_doubt_mm - truth.person_doubt_mm) <= 100
+    assert abs(fitted.joint_doubt_mm - truth.joint_doubt_mm) <= 100
+    covered = (answers.error_mm <= answers.sigma_mm(fitted)).mean()
+    assert covered == pytest.approx(0.68, abs=0.02)
+    assert "100%" in photo_sigma.report("fit", replace(answers, error_mm=answers.spread_mm), fitted)
+
+
+def test_the_command_measures_photos_with_truth(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = json.loads((RENDERS / "ground_truth.json").read_text())
+    records = [
+        {
+            "image": render["file"],
+            "joints_px": render["joints_2d_px"],
+            "joints_mm": render["joints_3d_mm"],
+            "focal_length_px": render["K"][0][0],
+            "principal_point_px": [render["K"][0][2], render["K"][1][2]],
+        }
+        for render in truth["images"]
+    ]
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for record in records:
+        shutil.copy(RENDERS / record["image"], photos)
+    (photos / "annotations.json").write_text(json.dumps({"images": 3 * records}))
+    library = tmp_path / "tiny"
+    build_library(library, PosePrior.load(), BuildSettings(name="tiny", n_poses=2_000, seed=3))
+    command = ["--renders", str(photos), "--library", str(library), "--network", "off"]
+    photo_sigma.main(command)
+    printed = capsys.readouterr().out
+    assert f"{3 * len(records)} people, {3 * len(records)} lifted" in printed
+    assert printed.count("\n| ") == 4
+
+    del records[0]["joints_mm"]
+    (photos / "annotations.json").write_text(json.dumps({"images": 3 * records}))
+    with pytest.raises(SystemExit, match="no 3D truth"):
+        photo_sigma.main(command)
