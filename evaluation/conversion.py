@@ -76,6 +76,8 @@ def main() -> None:
     args = parser.parse_args()
     people = [read_people(path) for path in sorted(args.data.glob("photos_[ab].tar"))]
     kept = [p for p in people if len(p[2])]
+    if not kept:
+        parser.error(f"--data {args.data} has no photos_a.tar or photos_b.tar with people to use")
     landmarks, joints, held_out = (np.concatenate(parts) for parts in zip(*kept, strict=True))
     index = CONVERSIONS["mediapipe33"].skeleton.index
     shoulders = landmarks[:, [index("left_shoulder"), index("right_shoulder")]].mean(1)

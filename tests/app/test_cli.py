@@ -183,16 +183,21 @@ def test_bench(library_dir: Path) -> None:
     assert "photos a second" in table.stdout
 
 
-def test_evaluate_lists_and_runs_programs() -> None:
+def test_evaluate_lists_and_runs_programs(library_dir: Path, tmp_path: Path) -> None:
     listed = invoke("evaluate")
     assert listed.exit_code == 0
     names = {line.split()[0] for line in listed.stdout.splitlines()}
     assert {"lifting", "paper", "pose2d", "renders"} <= names
     assert "metrics" not in names, "no program"
+    measured = run("evaluate", "renders", "--data", RENDERS, library_dir=library_dir)
+    assert "mean (4 of 4 lifted)" in measured.stdout, measured.stderr
     for program in ("renders", "paper"):
         helped = run("evaluate", program, "--help")
         assert helped.returncode == 0
         assert f"posematch evaluate {program}" in helped.stdout
+    nothing = run("evaluate", "conversion", "--data", tmp_path)
+    assert nothing.returncode == 2
+    assert "photos_a.tar" in nothing.stderr
     unknown = invoke("evaluate", "luck")
     assert unknown.exit_code == 2
     assert "lifting" in unknown.stderr
