@@ -48,6 +48,10 @@ def compiled() -> ctypes.CDLL:
         *(number, array, array, array, array, array, real, real),
     ]
     library.posematch_observe_state.restype = None
+    library.posematch_observe_joints.argtypes = [
+        *(number, number, array, array, array, array, array),
+    ]
+    library.posematch_observe_joints.restype = None
     library.posematch_observe_pairs.argtypes = [
         *(number, array, array, real, real, number, array, real),
     ]

@@ -50,13 +50,14 @@ WIDE double invert(int64_t n, const double* prior, double var, double* inverse,
 }  // namespace
 
 // Of `prior` (n, n) and `innovation` (n,) at noise variances (L,): the log of each level's share in
-// the evidence (L,), what leaving out each joint adds to its log evidence (L, n / 2), the joint
-// being anywhere within `elsewhere` instead, and the mean precision (n, n) over the levels.
+// the evidence (L,), what leaving out each joint adds to the log evidence of all levels (n / 2,),
+// the joint being anywhere within `elsewhere` instead, and the mean precision (n, n) over the levels.
 extern "C" void posematch_evidence(int64_t n, int64_t n_levels, const double* prior,
                                    const double* innovation, const double* noise_var,
-                                   double elsewhere, double* log_share, double* without,
+                                   double elsewhere, double* log_share, double* odds,
                                    double* mean_precision) {
     std::vector<double> inverses(n_levels * n * n), factor(n * n), pull(n);
+    std::vector<double> without(n_levels * (n / 2));
     for (int64_t l = 0; l < n_levels; ++l) {
         double* inverse = &inverses[l * n * n];
         const double log_determinant = invert(n, prior, noise_var[l], inverse, factor);
@@ -89,5 +90,13 @@ extern "C" void posematch_evidence(int64_t n, int64_t n_levels, const double* pr
         log_share[l] -= top + std::log(total);
         const double share = std::exp(log_share[l]);
         for (int64_t i = 0; i < n * n; ++i) mean_precision[i] += share * inverses[l * n * n + i];
+    }
+    // Each joint at its own level, relative to the evidence of all joints, whose shares sum to 1.
+    for (int64_t j = 0; j < n / 2; ++j) {
+        const auto log_of = [&](int64_t l) { return without[l * (n / 2) + j] + log_share[l]; };
+        double most = log_of(0), sum = 0.0;
+        for (int64_t l = 1; l < n_levels; ++l) most = std::max(most, log_of(l));
+        for (int64_t l = 0; l < n_levels; ++l) sum += std::exp(log_of(l) - most);
+        odds[j] = std::log(sum) + most;
     }
 }

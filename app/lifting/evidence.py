@@ -31,8 +31,8 @@ class Evidence:
         covariance = np.ascontiguousarray(prior, dtype=np.float64)
         seen = np.ascontiguousarray(innovation, dtype=np.float64)
         levels = np.ascontiguousarray(noise_var, dtype=np.float64)
-        self._log_share = np.empty(len(levels))
-        self._without = np.empty((len(levels), size // 2))
+        log_share = np.empty(len(levels))
+        self._odds = np.empty(size // 2)
         self.mean_precision: Floats = np.empty((size, size))
         compiled().posematch_evidence(
             size,
@@ -41,11 +41,11 @@ class Evidence:
             seen.ctypes.data,
             levels.ctypes.data,
             OUTLIER_SIGMA_PX,
-            self._log_share.ctypes.data,
-            self._without.ctypes.data,
+            log_share.ctypes.data,
+            self._odds.ctypes.data,
             self.mean_precision.ctypes.data,
         )
-        self.mean_noise_var = float(np.exp(self._log_share) @ levels)
+        self.mean_noise_var = float(np.exp(log_share) @ levels)
 
     def suspect(self, confidence: Floats, outlier_prior: float) -> int | None:
         """The joint (row of the seen ones) that is more probably elsewhere than noisy, if any.
@@ -53,10 +53,7 @@ class Evidence:
         Compares "all joints are where they say" with "all but j, and j is anywhere within
         :data:`OUTLIER_SIGMA_PX`", each at its own noise level.
         """
-        # Relative to the evidence of all joints, whose levels' shares sum to 1.
-        without = self._without + self._log_share[:, None]
-        top = without.max(axis=0)
         wrong = np.minimum(np.maximum(1.0 - confidence, outlier_prior), 1.0 - outlier_prior)
-        odds = np.log(np.exp(without - top).sum(axis=0)) + top + np.log(wrong / (1.0 - wrong))
+        odds = self._odds + np.log(wrong / (1.0 - wrong))
         worst = int(np.argmax(odds))
         return worst if odds[worst] > 0 else None

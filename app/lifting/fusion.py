@@ -29,7 +29,7 @@ from app.lifting.ensemble import Ensemble, LocalPrior, local_prior
 from app.lifting.evidence import Evidence
 from app.lifting.geometry import Floats
 from app.lifting.learned import apart_mm, misplaced, with_learned
-from app.lifting.update import answer_of, made_symmetric
+from app.lifting.update import answer_of, made_symmetric, observe_joints
 from models.pose_lifter import LearnedPose
 
 
@@ -131,19 +131,14 @@ def fuse(
         localisation_bones=settings.localisation_bones,
     )
     innovation = observed[rows] - prior.mean[rows]
-    gain = prior.covariance[:, rows]
-    expected = gain[rows]
+    reach = prior.covariance[rows]
+    expected = reach.take(rows, axis=1)
     if covariance_px2 is not None:
         blocks = expected.reshape(len(seen), 2, len(seen), 2)
         each = np.arange(len(seen))
         blocks[each, :, each] += covariance_px2[seen] / confidence[seen, None, None]
     evidence = Evidence(expected, innovation, np.square(settings.noise_px))
-    pulled = gain @ evidence.mean_precision
-    posterior = LocalPrior(
-        prior.mean + pulled @ innovation,
-        prior.covariance - pulled @ gain.T,
-        prior.root_depth_mm,
-    )
+    posterior = observe_joints(prior, reach, evidence.mean_precision, innovation)
     of_neighbours = posterior
     if learned is not None:
         doubt = settings.doubt(evidence.mean_noise_var)

@@ -85,6 +85,21 @@ extern "C" WIDE void posematch_observe_state(int64_t n, double* mean, double* co
     take(n, n, &gain[0], &reach[0], covariance);
 }
 
+// The same after m numbers of it were observed, whose `innovation` (m,) has this mean `precision`
+// (m, m); `reach` (m, n) is their covariance with the state. In place.
+extern "C" WIDE void posematch_observe_joints(int64_t n, int64_t m, double* mean,
+                                              double* covariance, const double* reach,
+                                              const double* precision, const double* innovation) {
+    std::vector<double> gain(m * n);
+    for (int64_t a = 0; a < m; ++a)
+        for (int64_t b = 0; b < m; ++b)
+            for (int64_t i = 0; i < n; ++i)
+                gain[a * n + i] += precision[a * m + b] * reach[b * n + i];
+    for (int64_t a = 0; a < m; ++a)
+        for (int64_t i = 0; i < n; ++i) mean[i] += gain[a * n + i] * innovation[a];
+    take(n, m, &gain[0], reach, covariance);
+}
+
 // The same after it was observed that the segments (start, end) of each of so many pairs (2, 2)
 // are equally long, but for `sigma` of their log ratio; in place.
 extern "C" WIDE void posematch_observe_pairs(int64_t n_joints, double* mean, double* covariance,

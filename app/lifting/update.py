@@ -1,4 +1,4 @@
-"""Observations of a person's whole state, and what a state says of the person; the loops compiled.
+"""Observations of a person's state, and what a state says of the person; the loops compiled.
 
 A state is that of ``app.lifting.ensemble``, a Gaussian over it a ``LocalPrior``.
 """
@@ -71,6 +71,37 @@ def observe_state(
         settled.ctypes.data,
         doubt,
         errors,
+    )
+    return LocalPrior(mean, covariance, pose.root_depth_mm)
+
+
+def observe_joints(
+    pose: LocalPrior, reach: Floats, precision: Floats, innovation: Floats
+) -> LocalPrior:
+    """``pose`` after some of the state was observed.
+
+    Args:
+        pose: a Gaussian over states.
+        reach: (m, 3 J) covariance of what was observed with the state.
+        precision: (m, m) inverse of the innovation's covariance.
+        innovation: (m,) the observation less what was expected.
+
+    """
+    mean, covariance = _copied(pose)
+    rows, weights, news = (
+        np.ascontiguousarray(given, dtype=np.float64) for given in (reach, precision, innovation)
+    )
+    m = len(news)
+    if rows.shape != (m, _SIZE) or weights.shape != (m, m) or news.shape != (m,):
+        raise ValueError("reach, precision and innovation do not belong together")
+    compiled().posematch_observe_joints(
+        _SIZE,
+        m,
+        mean.ctypes.data,
+        covariance.ctypes.data,
+        rows.ctypes.data,
+        weights.ctypes.data,
+        news.ctypes.data,
     )
     return LocalPrior(mean, covariance, pose.root_depth_mm)
 

@@ -6,7 +6,7 @@ import pytest
 from app.lifting.ensemble import LocalPrior
 from app.lifting.geometry import Floats
 from app.lifting.stature import stature_mm
-from app.lifting.update import answer_of, made_symmetric, observe_state
+from app.lifting.update import answer_of, made_symmetric, observe_joints, observe_state
 from library_store.library import Library
 from library_store.prior import PosePrior
 from tests.app.lifting.conftest import asymmetry
@@ -66,6 +66,20 @@ def test_a_state_observed(pose: LocalPrior, people: Floats, doubt: float) -> Non
     assert found.root_depth_mm == ROOT_MM
     with pytest.raises(ValueError, match="no state"):
         observe_state(pose, said[1:], error, settled_var=settled, doubt=1.0, errors=2.0)
+
+
+def test_joints_observed(pose: LocalPrior) -> None:
+    rng = np.random.default_rng(2)
+    rows = np.r_[0:6, 8:28]
+    reach, innovation = pose.covariance[rows], rng.normal(size=26) * 5.0
+    precision = np.linalg.inv(reach[:, rows] + 9.0 * np.eye(26))
+    found = observe_joints(pose, reach, precision, innovation)
+    gain = reach.T @ precision
+    left = pose.covariance - gain @ reach
+    assert scaled(found, pose.mean + gain @ innovation, left) < 1e-9
+    np.testing.assert_array_equal(found.covariance, found.covariance.T)
+    with pytest.raises(ValueError, match="belong together"):
+        observe_joints(pose, reach[1:], precision, innovation)
 
 
 def test_sides_observed_as_equally_long(pose: LocalPrior) -> None:
