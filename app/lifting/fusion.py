@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.lifting.ensemble import Ensemble, LocalPrior, local_prior
+from app.lifting.ensemble import Ensemble, local_prior
 from app.lifting.evidence import Evidence
 from app.lifting.geometry import Floats
 from app.lifting.learned import apart_mm, misplaced, with_learned

@@ -72,7 +72,7 @@ def test_joints_observed(pose: LocalPrior) -> None:
     rng = np.random.default_rng(2)
     rows = np.r_[0:6, 8:28]
     reach, innovation = pose.covariance[rows], rng.normal(size=26) * 5.0
-    precision = np.linalg.inv(reach[:, rows] + 9.0 * np.eye(26))
+    precision = np.linalg.inv(reach[:, rows] + 9.0 * np.eye(26)).astype(np.float64)
     found = observe_joints(pose, reach, precision, innovation)
     gain = reach.T @ precision
     left = pose.covariance - gain @ reach
