@@ -188,13 +188,13 @@ def rounded_timings(timings_ms: Mapping[str, float]) -> dict[str, float]:
 def _person(person: SeenPerson, intrinsics: Intrinsics, wording: Wording) -> schemas.Person:
     names = wording.skeleton.joint_names
     seen = {
-        "box_px": tuple(round(value, LENGTH_DIGITS) for value in person.box_px),
+        "box_px": tuple(_list(np.array(person.box_px))),
         "score": None if person.score is None else round(person.score, RATIO_DIGITS),
         "joints_2d": tuple(
             schemas.Joint2D(name=name, x_px=x, y_px=y, confidence=c, sigma_px=s)
             for name, (x, y), c, s, present in zip(
                 names,
-                np.round(wording.points(person.joints_px), LENGTH_DIGITS).tolist(),
+                (np.round(wording.points(person.joints_px), LENGTH_DIGITS) + 0.0).tolist(),
                 wording.confidence(person.confidence),
                 wording.sigma(person.sigma_px),
                 wording.present(person.present),
@@ -280,7 +280,8 @@ def _source(source: Source) -> schemas.Source:
 
 
 def _list(values: Floats) -> list[float]:
-    rounded: list[float] = np.round(values, LENGTH_DIGITS).tolist()
+    # Adding 0.0 turns -0.0 into 0.0: one text per number.
+    rounded: list[float] = (np.round(values, LENGTH_DIGITS) + 0.0).tolist()
     return rounded
 
 
@@ -290,9 +291,8 @@ def _vector(values: Floats) -> schemas.Vector3:
 
 
 def _rows(points: Floats) -> schemas.Pose:
-    # Adding 0.0 turns -0.0 into 0.0: one text per number. Only nan differs from itself.
     rows = (np.round(points, LENGTH_DIGITS) + 0.0).tolist()
-    return tuple(tuple(row) if row[0] == row[0] else None for row in rows)
+    return tuple(tuple(row) if row[0] == row[0] else None for row in rows)  # nan is not itself
 
 
 def _matrix(rotation: Floats) -> schemas.Matrix3:

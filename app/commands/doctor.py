@@ -160,9 +160,9 @@ def _cache(settings: Settings) -> Finding:
     directory = settings.cache_dir
     if settings.library_dir is not None:
         return Finding("cache", "ok", "not needed: POSEMATCH_LIBRARY_DIR is set")
-    nearest = next(it for it in (directory, *directory.parents) if it.exists())
     try:
-        with tempfile.TemporaryFile(dir=nearest):
+        directory.exists()  # raises where this user may not look, or of a name that cannot be
+        with tempfile.TemporaryFile(dir=_nearest(directory)):
             pass
     except OSError as error:
         return Finding(
@@ -176,7 +176,7 @@ def _cache(settings: Settings) -> Finding:
 
 def _disk(settings: Settings) -> Finding:
     directory = settings.cache_dir
-    nearest = next(it for it in (directory, *directory.parents) if it.exists())
+    nearest = _nearest(directory)
     free = shutil.disk_usage(nearest).free
     if free >= LIBRARY_BYTES or _is_library_there(settings):
         return Finding("disk", "ok", f"{_mb(free)} free at {nearest}")
@@ -263,7 +263,7 @@ def _weights(directory: Path, name: str) -> Finding:
 
 def _library(settings: Settings) -> Finding:
     directory = settings.library_dir or default_library_dir(settings.cache_dir)
-    if settings.library_dir is None and not directory.exists():
+    if settings.library_dir is None and not os.path.exists(directory):
         return Finding(
             "library",
             "warning",
@@ -321,7 +321,12 @@ def _photo(settings: Settings) -> Finding:
 
 
 def _is_library_there(settings: Settings) -> bool:
-    return (settings.library_dir or default_library_dir(settings.cache_dir)).exists()
+    return os.path.exists(settings.library_dir or default_library_dir(settings.cache_dir))
+
+
+def _nearest(directory: Path) -> Path:
+    """The first of it and its parents that is there, as far as this user may see."""
+    return next(it for it in (directory, *directory.parents) if os.path.exists(it))
 
 
 def _split(message: str) -> tuple[str, str]:

@@ -95,6 +95,12 @@ def test_a_cache_that_is_no_directory(tmp_path: Path) -> None:
     assert "POSEMATCH_CACHE_DIR" in findings["cache"]["mend"]
 
 
+def test_a_cache_that_cannot_even_be_looked_for(tmp_path: Path) -> None:
+    findings = examine(1, cache_dir=tmp_path / ("a" * 300) / "cache")
+    assert findings["cache"]["state"] == "failure"
+    assert findings["library"]["state"] == "warning"
+
+
 def test_the_port(tmp_path: Path, server: Server) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -172,6 +173,14 @@ def test_bad_values_are_named(
 @pytest.mark.parametrize("body", [b"{", b"\xff\xfe", b"[" * 100_000])
 def test_no_json(server: Server, body: bytes) -> None:
     problem(server.client.post("/v1/lift", content=body), 400, "malformed-body")
+
+
+def test_zero_has_one_text(server: Server, renders: list[Render]) -> None:
+    body = request_of(renders[0])
+    body["people"][0]["joints_2d"][0]["x_px"] = -0.0
+    answer = server.client.post("/v1/lift", json=body)
+    assert answer.status_code == 200
+    assert not re.search(r"-0\.0\b", answer.text)
 
 
 def test_nan_is_no_coordinate(server: Server) -> None:
