@@ -135,7 +135,10 @@ class Settings(BaseSettings):
         description="Longest time a search in Milvus may take, retries included; then a 503.",
     )
     shortlist: int = Field(
-        30, ge=1, le=1000, description="Exemplars per person that are resectioned (eq. 4's k)."
+        30,
+        ge=1,
+        le=200,  # as many neighbours as are looked up
+        description="Exemplars per person that are resectioned (eq. 4's k).",
     )
     weights_dir: Path = Field(
         Path(__file__).resolve().parent.parent / "models" / "weights",

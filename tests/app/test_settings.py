@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from app.errors import StartupError
+from app.lifting.lifter import LiftingSettings
 from app.settings import Settings, load_settings
 
 
@@ -97,6 +98,13 @@ def test_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(StartupError, match="POSEMATCH_CACHE_DIR"):
         load_settings()
     assert load_settings(cache_dir=Path("cache")).cache_dir == Path("cache")
+
+
+def test_the_shortlist_is_of_the_neighbours_that_are_looked_up() -> None:
+    most = LiftingSettings().neighbours
+    assert load_settings(shortlist=most).shortlist == most
+    with pytest.raises(StartupError, match="POSEMATCH_SHORTLIST"):
+        load_settings(shortlist=most + 1)
 
 
 def test_every_setting_is_described() -> None:
