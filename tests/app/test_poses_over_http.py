@@ -73,6 +73,10 @@ def test_camera_places_the_exemplar(server: Server, renders: list[Render]) -> No
     assert np.linalg.det(rotation) == pytest.approx(1)
     placed = np.array(exemplar["joints_mm"]) @ rotation.T + camera["translation_mm"]
     np.testing.assert_allclose(placed, person["exemplar"]["joints_mm"], atol=0.01)
+    used = np.array([joint["confidence"] >= 0.2 for joint in person["joints_2d"]])
+    off_px = (project(person["exemplar"]["joints_mm"], camera) - joints_px(person))[used]
+    rms_px = np.sqrt((off_px**2).sum(axis=1).mean())
+    assert camera["reprojection_error_px"] == pytest.approx(rms_px, abs=0.01)
     assert exemplar["source"] == person["exemplar"]["source"]
     root = np.array(exemplar["joints_mm"])[[R_HIP, L_HIP]].mean(axis=0)
     np.testing.assert_allclose(root, 0, atol=0.1)
