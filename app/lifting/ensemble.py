@@ -18,7 +18,7 @@ from functools import cache
 
 import numpy as np
 
-from app.lifting.compiled import compiled
+from app.lifting.compiled import compiled, pointer
 from app.lifting.geometry import Floats, Integers
 from app.lifting.posterior import STANDARD_PX_PER_MM
 from app.lifting.proportions import PROPORTION_DIRECTIONS
@@ -93,24 +93,24 @@ def place_ensemble(
     px_per_unit = compiled().posematch_place(
         n,
         n_joints,
-        exemplars.ctypes.data,
-        turned.ctypes.data,
-        targets.ctypes.data,
-        shares.ctypes.data,
+        pointer(exemplars),
+        pointer(turned),
+        pointer(targets),
+        pointer(shares),
         _TYPICAL,
         len(directions),
-        directions.ctypes.data,
+        pointer(directions),
         R_HIP,
         L_HIP,
         NEAREST_TO_EXTENT,
         LEAST_EXTENT_MM,
         STANDARD_PX_PER_MM,
         len(STATURE_SEGMENTS),
-        STATURE_SEGMENTS.ctypes.data,
-        STATURE_SHARES.ctypes.data,
-        stature.ctypes.data,
-        states.ctypes.data,
-        root_depth.ctypes.data,
+        pointer(STATURE_SEGMENTS),
+        pointer(STATURE_SHARES),
+        pointer(stature),
+        pointer(states),
+        pointer(root_depth),
     )
     return Ensemble(
         states=states[:n],
@@ -156,18 +156,18 @@ def local_prior(
     compiled().posematch_local_prior(
         len(states),
         size,
-        states.ctypes.data,
+        pointer(states),
         len(seen),
-        seen.ctypes.data,
-        wanted.ctypes.data,
+        pointer(seen),
+        pointer(wanted),
         len(proportions),
-        proportions.ctypes.data,
+        pointer(proportions),
         bandwidth_px,
         adaptive,
-        factors.ctypes.data,
-        weights.ctypes.data,
-        mean.ctypes.data,
-        covariance.ctypes.data,
+        pointer(factors),
+        pointer(weights),
+        pointer(mean),
+        pointer(covariance),
     )
     image = np.arange(2 * LSP14.n_joints)
     covariance[image, image] += granularity_px**2

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.lifting.compiled import compiled
+from app.lifting.compiled import compiled, pointer
 from app.lifting.geometry import Floats
 
 OUTLIER_SIGMA_PX = 80.0
@@ -37,13 +37,13 @@ class Evidence:
         compiled().posematch_evidence(
             size,
             len(levels),
-            covariance.ctypes.data,
-            seen.ctypes.data,
-            levels.ctypes.data,
+            pointer(covariance),
+            pointer(seen),
+            pointer(levels),
             OUTLIER_SIGMA_PX,
-            log_share.ctypes.data,
-            self._odds.ctypes.data,
-            self.mean_precision.ctypes.data,
+            pointer(log_share),
+            pointer(self._odds),
+            pointer(self.mean_precision),
         )
         self.mean_noise_var = float(np.exp(log_share) @ levels)
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from app.lifting.compiled import compiled
+from app.lifting.compiled import compiled, pointer
 from app.lifting.geometry import Floats
 
 NEAREST_TO_EXTENT = 1.05
@@ -81,18 +81,18 @@ def resect(
     compiled().posematch_resect(
         math.prod(lead),
         joints,
-        points.ctypes.data,
-        start.ctypes.data,
-        targets.ctypes.data,
-        weights.ctypes.data,
+        pointer(points),
+        pointer(start),
+        pointer(targets),
+        pointer(weights),
         shared,
         iterations,
         robust_scale or 0.0,
         NEAREST_TO_EXTENT,
         LEAST_EXTENT_MM,
-        rotation.ctypes.data,
-        translation.ctypes.data,
-        placed.ctypes.data,
-        residuals.ctypes.data,
+        pointer(rotation),
+        pointer(translation),
+        pointer(placed),
+        pointer(residuals),
     )
     return Cameras(rotation, translation, placed, residuals)

@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from app.lifting.compiled import compiled
+from app.lifting.compiled import compiled, pointer
 from app.lifting.ensemble import LocalPrior
 from app.lifting.geometry import Floats
 from app.lifting.posterior import STANDARD_PX_PER_MM
@@ -64,11 +64,11 @@ def observe_state(
         raise ValueError("what was observed is no state")
     compiled().posematch_observe_state(
         _SIZE,
-        mean.ctypes.data,
-        covariance.ctypes.data,
-        said.ctypes.data,
-        spread.ctypes.data,
-        settled.ctypes.data,
+        pointer(mean),
+        pointer(covariance),
+        pointer(said),
+        pointer(spread),
+        pointer(settled),
         doubt,
         errors,
     )
@@ -97,11 +97,11 @@ def observe_joints(
     compiled().posematch_observe_joints(
         _SIZE,
         m,
-        mean.ctypes.data,
-        covariance.ctypes.data,
-        rows.ctypes.data,
-        weights.ctypes.data,
-        news.ctypes.data,
+        pointer(mean),
+        pointer(covariance),
+        pointer(rows),
+        pointer(weights),
+        pointer(news),
     )
     return LocalPrior(mean, covariance, pose.root_depth_mm)
 
@@ -111,12 +111,12 @@ def made_symmetric(pose: LocalPrior, px_per_unit: float, sigma: float) -> LocalP
     mean, covariance = _copied(pose)
     compiled().posematch_observe_pairs(
         LSP14.n_joints,
-        mean.ctypes.data,
-        covariance.ctypes.data,
+        pointer(mean),
+        pointer(covariance),
         px_per_unit,
         pose.root_depth_mm,
         len(_PAIRS),
-        _PAIRS.ctypes.data,
+        pointer(_PAIRS),
         sigma,
     )
     return LocalPrior(mean, covariance, pose.root_depth_mm)
@@ -158,22 +158,22 @@ def answer_of(pose: LocalPrior, px_per_unit: float, stature_mm: float) -> Answer
     joints, spread, bends = np.empty((n, 3)), np.empty(n), np.empty((len(_LIMB_SEGMENTS), 2))
     root_depth = compiled().posematch_answer(
         n,
-        mean.ctypes.data,
-        covariance.ctypes.data,
+        pointer(mean),
+        pointer(covariance),
         px_per_unit,
         pose.root_depth_mm,
         stature_mm,
         len(STATURE_SEGMENTS),
-        STATURE_SEGMENTS.ctypes.data,
-        STATURE_SHARES.ctypes.data,
+        pointer(STATURE_SEGMENTS),
+        pointer(STATURE_SHARES),
         R_HIP,
         L_HIP,
         STANDARD_PX_PER_MM,
         len(_LIMB_SEGMENTS),
-        _LIMB_SEGMENTS.ctypes.data,
-        joints.ctypes.data,
-        spread.ctypes.data,
-        bends.ctypes.data,
+        pointer(_LIMB_SEGMENTS),
+        pointer(joints),
+        pointer(spread),
+        pointer(bends),
     )
     return Answer(joints, spread, bends, root_depth)
 

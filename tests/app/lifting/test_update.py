@@ -1,8 +1,11 @@
 """The compiled observations of a state against their formulas in numpy."""
 
+import ctypes
+
 import numpy as np
 import pytest
 
+from app.lifting.compiled import pointer
 from app.lifting.ensemble import LocalPrior
 from app.lifting.geometry import Floats
 from app.lifting.stature import stature_mm
@@ -130,6 +133,17 @@ def test_a_limb_that_may_point_either_way_is_ambiguous(pose: LocalPrior) -> None
     assert answer.is_ambiguous(1.01 * ratio.min(), 0.0)
     assert not answer.is_ambiguous(0.99 * ratio.min(), 0.0)
     assert not answer.is_ambiguous(1e9, 1.01 * widest)
+
+
+def test_a_loop_is_told_where_numbers_are_and_strided_ones_are_refused() -> None:
+    numbers = np.arange(6.0)
+    where = pointer(numbers)
+    assert not isinstance(where, int)
+    assert ctypes.addressof(where) == numbers.ctypes.data
+    numbers.flags.writeable = False
+    assert pointer(numbers) == numbers.ctypes.data
+    with pytest.raises(TypeError, match="contiguous"):
+        pointer(np.zeros(6)[::2])
 
 
 def test_what_spread_takes_from_a_mean_pose_is_given_back() -> None:
