@@ -221,9 +221,15 @@ def _text(path: str | Path) -> str:
 
 
 def _write(path: Path, data: bytes) -> None:
+    """The picture whole or, where the disk is full, as it was before."""
+    part = path.with_name(f"{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
+        try:
+            part.write_bytes(data)
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
     except OSError as error:
         raise InvalidInputError([("image", f"{_text(path)}: {error.strerror}")]) from error
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import resource
 import shutil
 import subprocess
 from pathlib import Path
@@ -128,6 +129,23 @@ def test_predict_refuses_what_is_no_photo(library_dir: Path, tmp_path: Path) -> 
     done = run("predict", RENDERS / "000.jpg", library_dir=library_dir, max_body_bytes=1000)
     assert done.returncode == 1
     assert "1000 bytes" in done.stderr
+
+
+def test_a_picture_is_written_whole_or_not_at_all(library_dir: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "out.png"
+    picture.write_text("the picture of yesterday")
+    done = subprocess.run(
+        [COMMAND, "predict", RENDERS / "000.jpg", "--image", picture],
+        env=environment(library_dir=library_dir),
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000)),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert "File too large" in done.stderr
+    assert list(tmp_path.iterdir()) == [picture]
+    assert picture.read_text() == "the picture of yesterday"
 
 
 def test_predict_reads_no_more_than_a_photo_may_have() -> None:
