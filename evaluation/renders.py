@@ -163,7 +163,7 @@ def main() -> None:
     print("| image | people | PCK@0.2, 12 limb joints | PA mm, 12 | root-relative mm, 14 |")
     print("|---|---|---|---|---|")
     near, similar, centred = [], [], []
-    tilts_deg, turns_deg, reprojections_px = [], [], []
+    tilts_deg, turns_deg, reprojections_px, within = [], [], [], []
     found: list[Floats | None] = []
     for render in renders:
         truth_px, truth_mm = render.joints_px, render.joints_mm
@@ -181,7 +181,10 @@ def main() -> None:
         answer = person.lifted.joints_3d_mm
         near.append(correct_keypoints(person.joints_px, truth_px)[LIMBS])
         similar.append(float(similarity_error_mm(answer[LIMBS], truth_mm[LIMBS]).mean()))
-        centred.append(float(root_centred_error_mm(answer, truth_mm).mean()))
+        errors_mm = root_centred_error_mm(answer, truth_mm)
+        centred.append(float(errors_mm.mean()))
+        sigma_mm = person.lifted.sigma_mm
+        within.append(np.zeros(0, bool) if sigma_mm is None else errors_mm <= sigma_mm)
         exemplar = person.lifted.exemplar
         upright = float(np.clip(exemplar.rotation[:, 1] @ render.up, -1, 1))
         tilts_deg.append(float(np.degrees(np.arccos(upright))))
@@ -199,7 +202,8 @@ def main() -> None:
     print(
         f"\nMedians: camera's vertical {np.median(tilts_deg):.1f}°, trunk's orientation "
         f"{np.median(turns_deg):.1f}° from the truth; reprojection of the exemplar "
-        f"{np.median(reprojections_px):.1f} px.\n"
+        f"{np.median(reprojections_px):.1f} px. sigma_mm covers {np.concatenate(within).mean():.0%} of the "
+        "root-relative errors.\n"
     )
     print(by_2d(pipeline, renders, found))
 
