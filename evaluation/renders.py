@@ -202,8 +202,8 @@ def main() -> None:
     print(
         f"\nMedians: camera's vertical {np.median(tilts_deg):.1f}°, trunk's orientation "
         f"{np.median(turns_deg):.1f}° from the truth; reprojection of the exemplar "
-        f"{np.median(reprojections_px):.1f} px. sigma_mm covers {np.concatenate(within).mean():.0%} of the "
-        "root-relative errors.\n"
+        f"{np.median(reprojections_px):.1f} px. sigma_mm covers "
+        f"{np.concatenate(within).mean():.0%} of the root-relative errors.\n"
     )
     print(by_2d(pipeline, renders, found))
 
