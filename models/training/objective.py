@@ -1,4 +1,4 @@
-"""The loss: where is each joint (spatial cross-entropy), and is it there at all (beliefs)."""
+"""The loss: where is each joint (spatial cross-entropy), on which side, and is it there at all."""
 
 from __future__ import annotations
 
@@ -6,7 +6,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from library_store.skeleton import LSP14
+
 PRESENCE_WEIGHT = 0.1
+EXCHANGE_WEIGHT = 1.5
+APART = 0.06
+"""Share of the input's side from which on two joints of a pair count as being in two places."""
+PAIR_NATS, PERSON_NATS = 4.0, 2.0
+"""Log odds of a pair, and mean log odds of a person's pairs, that are as good as decided."""
+RIGHT = [j for j, other in enumerate(LSP14.mirror) if j < other]
+LEFT = [LSP14.mirror[j] for j in RIGHT]
 COARSE_SIGMA_CELLS, FINE_SIGMA_CELLS = 0.8, 1.2
 """Blur of the targets at stride 8 and at stride 4, in cells."""
 
@@ -27,7 +36,8 @@ def stage_loss(
     """Loss of one stage's (B, 15, h, w) logits.
 
     The joint maps' softmax over positions is compared with a Gaussian (weighted by trust in the
-    label); their sigmoid, and the background's, with the Gaussian itself where presence is known.
+    label), right with left by it; their sigmoid, and the background's, with the Gaussian itself
+    where presence is known.
     """
     n_joints = joints_px.shape[1]
     cells = logits.shape[-1]
@@ -38,6 +48,7 @@ def stage_loss(
     log_p = F.log_softmax(logits[:, :n_joints].flatten(2), -1)
     where = -(marginal * log_p).sum(-1)
     where = (where * weight).sum() / weight.sum().clamp_min(1.0)
+    sides = exchanged(log_p, joints_px, weight, size)
 
     seen = (presence > 0).float()[..., None, None] * target
     known = (presence >= 0).float()
@@ -47,7 +58,31 @@ def stage_loss(
     empty = 1 - seen.amax(1)
     background = F.binary_cross_entropy_with_logits(logits[:, n_joints], empty, reduction="none")
     background = (background.flatten(1).sum(-1) * whole).sum() / whole.sum().clamp_min(1.0)
-    return where + PRESENCE_WEIGHT * (belief + 0.1 * background)
+    return where + EXCHANGE_WEIGHT * sides + PRESENCE_WEIGHT * (belief + 0.1 * background)
+
+
+def exchanged(log_p: Tensor, joints_px: Tensor, weight: Tensor, size: int) -> Tensor:
+    """Share of pairs, plus share of people, whose sides are believed the wrong way round.
+
+    ``log_p`` (B, J, h w) log marginals; ``joints_px`` and ``weight`` as in :func:`stage_loss`. From
+    the log odds of a pair as labelled against exchanged, through a sigmoid: it is bounded, so the
+    few people whose labels are exchanged do not outweigh those who are merely undecided.
+    """
+    cells = round(log_p.shape[-1] ** 0.5)
+    cell = ((joints_px + 0.5) / (size / cells) - 0.5).round().long().clamp(0, cells - 1)
+    place = cell[..., 1] * cells + cell[..., 0]
+
+    def at(maps: list[int], places: list[int]) -> Tensor:
+        return log_p[:, maps].gather(2, place[:, places, None])[..., 0]
+
+    apart = (joints_px[:, RIGHT] - joints_px[:, LEFT]).norm(dim=-1) > APART * size
+    trust = torch.minimum(weight[:, RIGHT], weight[:, LEFT]) * apart
+    odds = at(RIGHT, RIGHT) - at(RIGHT, LEFT) + at(LEFT, LEFT) - at(LEFT, RIGHT)
+    pairs = (torch.sigmoid(-odds / PAIR_NATS) * trust).sum() / trust.sum().clamp_min(1.0)
+    mean = (odds * trust).sum(1) / trust.sum(1).clamp_min(0.1)
+    several = (trust.sum(1) > 1).float()
+    people = (torch.sigmoid(-mean / PERSON_NATS) * several).sum() / several.sum().clamp_min(1.0)
+    return pairs + people
 
 
 def total_loss(
