@@ -29,6 +29,7 @@ from models.training.export import config_of, pose_card, publish, read_weights
 from models.training.network import ConvolutionalPoseMachine
 from models.training.objective import total_loss
 from models.training.onnx_graph import pose_model
+from models.training.precision import mixed_precision
 from models.training.train import measure, to_batch
 
 LEAST_HELD, LEAST_TRAINED = 5, 20
@@ -152,7 +153,7 @@ def finetune(
 
     def loss_of(model: ConvolutionalPoseMachine, batch: loop.Batch) -> Tensor:
         x, joints, weight, presence = batch
-        with torch.autocast(device, torch.bfloat16):
+        with mixed_precision(device):
             stages = model(x)
         return total_loss(stages, joints, weight, presence, x.shape[-1])
 

@@ -18,6 +18,7 @@ from models.training.augment import Sample, canonical, random_view
 from models.training.dataset import LabelledCrop, read_crops
 from models.training.network import ConvolutionalPoseMachine, CpmConfig
 from models.training.objective import total_loss
+from models.training.precision import mixed_precision
 
 
 def to_batch(samples: list[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -58,7 +59,7 @@ def measure(
     for start in range(0, len(crops), 64):
         samples = [canonical(c, size) for c in crops[start : start + 64]]
         x, joints, weight, _ = to_batch(samples)
-        with torch.no_grad(), torch.autocast(device, torch.bfloat16):
+        with torch.no_grad(), mixed_precision(device):
             logits = model(x.to(device))[-1]
         predicted.append(peaks_px(logits, model.cfg.n_joints, size))
         truth.append(joints.numpy())
@@ -100,7 +101,7 @@ def main() -> None:
 
     def loss_of(model: ConvolutionalPoseMachine, batch: loop.Batch) -> Tensor:
         x, joints, weight, presence = batch
-        with torch.autocast(args.device, torch.bfloat16):
+        with mixed_precision(args.device):
             stages = model(x)
         return total_loss(stages, joints, weight, presence, x.shape[-1])
 

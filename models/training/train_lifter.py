@@ -29,6 +29,7 @@ from models.training.lifter_network import (
     read_last,
 )
 from models.training.lifter_samples import IN_MIRROR, Floats, Samples, draw
+from models.training.precision import has_bf16
 
 CHUNK, BATCH, POOL, MEASURED = 16_384, 1_024, 250_000, 16_384
 RATE, WARM_UP_STEPS, STEADY, AVERAGE = 1.5e-3, 500, 0.15, 0.9985
@@ -43,6 +44,7 @@ def train(poses_mm: Floats, minutes: float, seed: int) -> tuple[PoseMlp, int]:
     rng = np.random.default_rng(seed)
     torch.manual_seed(seed)
     torch.set_num_threads(1)
+    bf16 = has_bf16("cpu")
     network, average = PoseMlp(), PoseMlp()
     average.load_state_dict(network.state_dict())
     optimiser = torch.optim.AdamW(
@@ -51,7 +53,7 @@ def train(poses_mm: Floats, minutes: float, seed: int) -> tuple[PoseMlp, int]:
 
     @torch.compile
     def loss_of(features: Tensor, *wanted: Tensor) -> tuple[Tensor, Tensor]:
-        with torch.autocast("cpu", dtype=torch.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
             last = network(features)
         distance, surprise = losses(last, *wanted)
         return distance + SURPRISE * surprise, distance

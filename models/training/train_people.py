@@ -21,6 +21,7 @@ from models.training.crowds import calm_patches, crowd
 from models.training.cutout import whole
 from models.training.dataset import read_crops
 from models.training.network import PersonConfig, PersonNetwork
+from models.training.precision import mixed_precision
 from models.training.scenes import (
     UNSURE,
     SceneSample,
@@ -132,7 +133,7 @@ def main() -> None:
 
     def loss_of(model: PersonNetwork, batch: loop.Batch) -> Tensor:
         x, heat, sides, weight, trust = batch
-        with torch.autocast(args.device, torch.bfloat16):
+        with mixed_precision(args.device):
             out = model(x)
         return loss_from(out, heat, sides, weight, trust)
 
