@@ -24,7 +24,7 @@ from tests.deploy.states import States
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "deploy" / "ray_serve.yaml"
 REPLICA = b"ray::ServeReplica:posematch:posematch"
-PATIENCE_S = 100.0
+PATIENCE_S = 200.0
 # An address of this machine that Ray does not take for a laptop's own.
 _NODE = "127.0.0.2"
 # Ray gives its own processes 30 s to start, which a busy machine may exceed.
