@@ -151,7 +151,7 @@ class Settings(BaseSettings):
         "machine runs within POSEMATCH_MODEL_BUDGET_MS.",
     )
     model_budget_ms: float = Field(
-        12.0,
+        15.0,
         gt=0,
         description="CPU time a person that POSEMATCH_MODEL=auto may spend, as the cards have it.",
     )

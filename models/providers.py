@@ -26,8 +26,9 @@ PACKAGES: dict[Provider, str] = {
     "openvino": "onnxruntime-openvino",
     "cpu": "onnxruntime",
 }
-INT8_FEATURES = ("amx_int8", "avx512_vnni", "avx_vnni", "asimddp")
-"""CPU features with dot products of 8-bit integers; without one int8 gains nothing over fp32."""
+INT8_FEATURES = ("avx2", "asimddp")
+"""CPU features with which 8-bit integers are multiplied faster than single precision: almost twice
+as fast with AVX2 alone, more with what newer CPUs have beside it."""
 BF16_FEATURES = ("amx_bf16", "avx512_bf16")
 """CPU features with dot products of bfloat16."""
 

@@ -10,6 +10,8 @@ import pytest
 from app.errors import StartupError
 from app.lifting.lifter import LiftingSettings
 from app.settings import Settings, load_settings
+from models.card import WEIGHTS_DIR, read_card, write_card
+from models.choice import choose
 
 
 @pytest.fixture(autouse=True)
@@ -105,6 +107,17 @@ def test_the_shortlist_is_of_the_neighbours_that_are_looked_up() -> None:
     assert load_settings(shortlist=most).shortlist == most
     with pytest.raises(StartupError, match="POSEMATCH_SHORTLIST"):
         load_settings(shortlist=most + 1)
+
+
+@pytest.mark.parametrize("fp32_ms", [12.0, 12.9])
+def test_the_budget_suffices_for_all_looks_without_vnni(tmp_path: Path, fp32_ms: float) -> None:
+    """Costs of a CPU that has AVX2 alone, as ``posematch model check --save`` wrote them there."""
+    for name, cost_ms in {"cpm": {"cpu/fp32": fp32_ms}, "cpm-int8": {"cpu/int8": 13.6}}.items():
+        card = read_card(WEIGHTS_DIR / f"{name}.json")
+        write_card(tmp_path / f"{name}.json", card.model_copy(update={"cost_ms": cost_ms}))
+    budget_ms, features = Settings().model_budget_ms, frozenset({"avx2"})
+    chosen = choose(tmp_path, "pose", provider="cpu", budget_ms=budget_ms, features=features)
+    assert chosen == "cpm-int8"
 
 
 def test_every_setting_is_described() -> None:
