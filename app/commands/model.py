@@ -170,7 +170,7 @@ def finetune(
     """Train the pose network further on your own labelled images.
 
     Labels are a COCO keypoints file with the folder of its images, or Human3.6M as unpacked. Whole
-    images (clips) are held out and measured before and after. Needs the extra `train`.
+    images (takes) are held out and measured before and after. Needs the extra `train`.
 
     \b
     posematch model finetune --coco person_keypoints.json --images photos --out ours
