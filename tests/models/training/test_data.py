@@ -7,13 +7,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from library_store.skeleton import LSP14, R_HIP
+from models.errors import AnnotationError
 from models.training.augment import MIRROR, canonical, crop_matrix, random_view
 from models.training.dataset import (
     DEV_LABELLED,
     DEV_RENDERED,
     LabelledCrop,
+    decode_members,
     held_out,
     load,
     read_crops,
@@ -47,6 +50,43 @@ def test_labels_are_read_and_hardly_labelled_crops_left_out(tmp_path: Path) -> N
     assert [c.name for c in crops] == ["a.jpg"]
     np.testing.assert_allclose(crops[0].joints_px, joints)
     assert crops[0].weight[-1] == 0
+
+
+def _photo(path: Path, brightness: int = 0) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.full((32, 32, 3), brightness, np.uint8))
+    return path
+
+
+def test_photos_in_subfolders_and_of_any_suffix_are_read(tmp_path: Path) -> None:
+    _photo(tmp_path / "one" / "a.jpg")
+    _photo(tmp_path / "two" / "b.JPG")
+    _photo(tmp_path / "c.jpeg")
+    (tmp_path / "two" / "._b.JPG").write_bytes(b"of macOS")
+    (tmp_path / "notes.txt").write_text("no photo")
+    assert set(decode_members(tmp_path)) == {"a.jpg", "b.JPG", "c.jpeg"}
+    with tarfile.open(tmp_path / "all.tar", "w") as tar:
+        for folder in ("one", "two"):
+            tar.add(tmp_path / folder, folder)
+    assert set(decode_members(tmp_path / "all.tar")) == {"a.jpg", "b.JPG"}
+
+
+def test_photos_that_cannot_be_told_or_read_are_named(tmp_path: Path) -> None:
+    with pytest.raises(AnnotationError, match="has no JPEG"):
+        decode_members(tmp_path)
+    _photo(tmp_path / "one" / "a.jpg")
+    second = _photo(tmp_path / "two" / "a.jpg", 99)
+    with pytest.raises(AnnotationError, match=r"two files a\.jpg"):
+        decode_members(tmp_path)
+    second.rename(tmp_path / "b.jpg")
+    for data in (b"", b"oops"):
+        (tmp_path / "b.jpg").write_bytes(data)
+        with pytest.raises(AnnotationError, match=r"b\.jpg is no JPEG"):
+            decode_members(tmp_path)
+    record = {"image": "gone.jpg", "joints_px": [[1, 2]] * 14, "labelled": [1] * 14}
+    (tmp_path / "annotations.json").write_text(json.dumps({"images": [record]}))
+    with pytest.raises(AnnotationError, match=r"names gone\.jpg, which is not there"):
+        load(tmp_path)
 
 
 def _tar(path: Path, count: int, joints: list[list[float]], no_torso: int = -1) -> None:
