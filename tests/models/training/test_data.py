@@ -1,6 +1,5 @@
 """What needs no torch: reading data sets, holding photos out, random views."""
 
-import io
 import json
 import tarfile
 from pathlib import Path
@@ -22,6 +21,7 @@ from models.training.dataset import (
     read_crops,
 )
 from models.training.scenes import mosaic
+from tests.models.training.data_files import write_tar
 
 
 def labelled_crop(group: int = 0) -> LabelledCrop:
@@ -91,22 +91,10 @@ def test_photos_that_cannot_be_told_or_read_are_named(tmp_path: Path) -> None:
 
 def _tar(path: Path, count: int, joints: list[list[float]], no_torso: int = -1) -> None:
     """Crops, one of them (``no_torso``) with a hip that nobody labelled."""
-    records = [
-        {
-            "image": f"{path.stem}{i}.jpg",
-            "joints_px": joints,
-            "labelled": [int(i != no_torso or joint != R_HIP) for joint in range(14)],
-        }
-        for i in range(count)
-    ]
-    _, jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))
-    members = [("annotations.json", json.dumps({"images": records}).encode())]
-    members += [(str(r["image"]), jpeg.tobytes()) for r in records]
-    with tarfile.open(path, "w") as tar:
-        for name, data in members:
-            info = tarfile.TarInfo(name)
-            info.size = len(data)
-            tar.addfile(info, io.BytesIO(data))
+    labelled = np.ones((count, 14), int)
+    if no_torso >= 0:
+        labelled[no_torso, R_HIP] = 0
+    write_tar(path, np.zeros((count, 8, 8, 3), np.uint8), joints, labelled)
 
 
 def test_a_starred_file_is_drawn_more_often_and_what_is_kept_aside_is_not_trained_on(
