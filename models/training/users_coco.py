@@ -5,7 +5,8 @@ knees and ankles with ``left_``/``right_`` (or ``l_``/``r_``) before them, and `
 ``head_top`` where there are any; others (eyes, ears, toes) are left out, and so are categories
 without these limbs. Visibility is COCO's: 0 not labelled, 1 labelled but hidden, 2 seen; null and
 NaN, which some tools write for what is not labelled, are taken for 0. Pixels are those of the
-stored file, whatever its EXIF orientation says.
+stored file; of the photo turned upright, as its EXIF orientation says, where only that has the size
+which the file of labels states (phones' photos in tools that show them upright).
 """
 
 from __future__ import annotations
@@ -226,17 +227,21 @@ def _read_image(annotations: Path, folder: Path, record: _Image) -> Image:
             f"{annotations}: image {record.id} is {path}, which does not exist; "
             "is this the folder that file_name is relative to?"
         )
-    pixels = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if pixels is None:
-        raise AnnotationError(f"{path} is no image that can be decoded")
-    height, width = pixels.shape[:2]
-    stated = record.width or width, record.height or height
-    if stated != (width, height):
-        raise AnnotationError(
-            f"{path} is {width}x{height} px, but {annotations} labelled an image of "
-            f"{stated[0]}x{stated[1]}: it was resized or turned since"
-        )
-    return np.asarray(pixels, np.uint8)
+    sizes = []
+    for way in (cv2.IMREAD_IGNORE_ORIENTATION, 0):
+        pixels = cv2.imread(str(path), cv2.IMREAD_COLOR | way)
+        if pixels is None:
+            raise AnnotationError(f"{path} is no image that can be decoded")
+        height, width = pixels.shape[:2]
+        stated = record.width or width, record.height or height
+        if stated == (width, height):
+            return np.asarray(pixels, np.uint8)
+        sizes.append((width, height))
+    raise AnnotationError(
+        f"{path} is {sizes[0][0]}x{sizes[0][1]} px, but {annotations} labelled an image of "
+        f"{record.width or sizes[0][0]}x{record.height or sizes[0][1]}: it was resized or turned "
+        "since"
+    )
 
 
 def _check_points(path: Path, name: str, points: NDArray[np.float64], pixels: Image) -> None:

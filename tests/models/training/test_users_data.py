@@ -15,6 +15,7 @@ from library_store.skeleton import LSP14
 from models.errors import AnnotationError
 from models.training.users_coco import KEPT_PX, read_coco
 from models.training.users_h36m import read_human36m
+from tests.app.imaging.test_decode import tiff, with_exif
 from tests.models.training import user_files
 
 JOINT = {name: i for i, name in enumerate(LSP14.joint_names)}
@@ -94,6 +95,32 @@ def test_what_tools_write_for_not_labelled(tmp_path: Path, nothing: float | None
     for ours, theirs in zip(found, wanted, strict=True):
         np.testing.assert_array_equal(ours.joints_px, theirs.joints_px)
         np.testing.assert_array_equal(ours.weight, theirs.weight)
+
+
+def test_phone_photos_labelled_upright_are_read_upright(tmp_path: Path) -> None:
+    records = user_files.coco(tmp_path / "images", 1)
+    path = user_files.write(tmp_path / "labels.json", records)
+    wanted = read_coco(path, tmp_path / "images")
+    image = cv2.imread(str(tmp_path / "images" / "0.png"))
+    assert image is not None
+    lying = cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE)
+    _, jpeg = cv2.imencode(".jpg", lying, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    (tmp_path / "images" / "0.jpg").write_bytes(with_exif(jpeg.tobytes(), tiff(6)))
+    records["images"][0]["file_name"] = "0.jpg"
+    found = read_coco(user_files.write(path, records), tmp_path / "images")
+    for ours, theirs in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(ours.joints_px, theirs.joints_px)
+        assert np.abs(ours.image.astype(int) - theirs.image).mean() < 14, "as JPEG has it"
+    # A tool that shows photos as they are stored states their size so.
+    records["images"][0] |= {"width": 240, "height": 320}
+    for record in records["annotations"]:
+        triples = np.array(record["keypoints"]).reshape(-1, 3)
+        x, y, v = triples.T
+        record["keypoints"] = np.stack([y, np.where(v > 0, 319 - x, 0), v], 1).ravel().tolist()
+    found = read_coco(user_files.write(path, records), tmp_path / "images")
+    for ours, theirs in zip(found, wanted, strict=True):
+        turned = cv2.rotate(theirs.image, cv2.ROTATE_90_COUNTERCLOCKWISE)
+        assert np.abs(ours.image.astype(int) - turned).mean() < 14
 
 
 def test_a_file_under_two_ids_is_one_image(tmp_path: Path) -> None:
