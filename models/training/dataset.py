@@ -238,17 +238,19 @@ def read_crops(
     """Training crops, and by name the held-out ones that errors can be measured on.
 
     Comma-separated names of tars in ``folder``, or paths, without ".tar"; ``name*2`` is drawn
-    twice as often. Files called rendered* are trained on whole but for a few.
+    twice as often. Files called lspet* and rendered* are trained on whole but for their last crops,
+    of others one photo in ``HOLD_OUT_ONE_IN`` is held out.
     """
     crops: list[LabelledCrop] = []
     kept: dict[str, list[LabelledCrop]] = {"photos_dev": [], "labelled_dev": []}
     for item in train.split(","):
         name, _, times = item.partition("*")
         loaded = load(folder / f"{name}.tar")
-        if name.startswith("lspet"):
-            kept["labelled_dev"] += [c for c in loaded[-DEV_LABELLED:] if c.has_torso]
+        kind = Path(name).name
+        if kind.startswith("lspet"):
+            kept["labelled_dev"] += loaded[-DEV_LABELLED:]
             used = loaded[:-DEV_LABELLED]
-        elif Path(name).name.startswith("rendered"):
+        elif kind.startswith("rendered"):
             kept.setdefault("rendered_dev", []).extend(loaded[-DEV_RENDERED:])
             used = loaded[:-DEV_RENDERED]
         else:
@@ -257,4 +259,4 @@ def read_crops(
         crops += used * int(times or 1)
     for name in filter(None, test.split(",")):
         kept[name] = load(folder / f"{name}.tar")
-    return crops, kept
+    return crops, {name: [c for c in those if c.has_torso] for name, those in kept.items()}

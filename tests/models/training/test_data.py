@@ -121,6 +121,12 @@ def test_errors_are_not_measured_by_a_torso_that_nobody_labelled(tmp_path: Path)
     names = {c.name for c in kept["labelled_dev"]}
     assert len(names) == DEV_LABELLED - 1
     assert "lspet_x10.jpg" not in names | {c.name for c in crops}
+    # The same by its path, and of what is only measured on.
+    _tar(tmp_path / "mine.tar", 12, joints, no_torso=10)
+    crops, kept = read_crops(Path("/elsewhere"), str(tmp_path / "lspet_x"), str(tmp_path / "mine"))
+    assert {c.name for c in kept["labelled_dev"]} == names
+    assert len(crops) == 3
+    assert len(kept[str(tmp_path / "mine")]) == 11
 
 
 def test_a_photo_is_held_out_whole_and_always_the_same_ones() -> None:
