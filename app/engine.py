@@ -23,6 +23,7 @@ from library_store.manifest import read_manifest
 from library_store.milvus import MilvusSettings
 from models import ModelCard, ModelError, PersonDetector, PoseEstimator, PoseLifter
 from models.choice import choose
+from models.session import runtimes
 
 Progress = Callable[[str, float], None]
 
@@ -80,6 +81,25 @@ def chosen_networks(settings: Settings) -> tuple[str, str]:
     return pose, choose(where, "people", provider=provider)
 
 
+def load_networks(settings: Settings) -> tuple[PoseEstimator, PersonDetector]:
+    """The chosen networks, on the providers they were chosen for. Raises ``ModelError``.
+
+    Where an installed provider cannot be started, another runs the networks: what is best there is
+    chosen anew.
+    """
+    pose, people = chosen_networks(settings)
+    where, provider, side_by_side = settings.weights_dir, settings.provider, settings.workers
+    estimator = PoseEstimator(pose, weights_dir=where, provider=provider, concurrency=side_by_side)
+    detector = PersonDetector(
+        people, weights_dir=where, provider=provider, concurrency=side_by_side
+    )
+    for network in (estimator, detector):
+        used = network.runtime
+        if used != runtimes(network.card, provider)[0]:
+            return load_networks(settings.model_copy(update={"provider": used.provider}))
+    return estimator, detector
+
+
 def load_lifter(settings: Settings) -> PoseLifter | None:
     """The lifting network of the settings, None for off. Raises ``ModelError``."""
     if settings.lifter == LIFTER_OFF:
@@ -97,15 +117,7 @@ def load_engine(settings: Settings) -> Engine:
     """
     cv2.setNumThreads(1)  # the workers are the parallelism
     try:
-        pose, people = chosen_networks(settings)
-        where, provider = settings.weights_dir, settings.provider
-        side_by_side = settings.workers
-        estimator = PoseEstimator(
-            pose, weights_dir=where, provider=provider, concurrency=side_by_side
-        )
-        detector = PersonDetector(
-            people, weights_dir=where, provider=provider, concurrency=side_by_side
-        )
+        estimator, detector = load_networks(settings)
         lifter = load_lifter(settings)
         estimator.warm_up(MAX_PEOPLE)
         detector.warm_up()
@@ -131,7 +143,11 @@ def reload_engine(engine: Engine, settings: Settings) -> Engine | None:
         raise StartupError(str(error)) from error
     library = _open_library(directory, settings)
     pipeline = _assemble(engine.detector, engine.estimator, engine.lifter, library, settings)
-    _warm_up(pipeline, settings.max_pixels)
+    try:
+        _warm_up(pipeline, settings.max_pixels)
+    except BaseException:
+        library.close()
+        raise
     return replace(engine, library=library, pipeline=pipeline)
 
 

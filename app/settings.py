@@ -14,6 +14,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from app import MAX_DECODABLE_PIXELS
 from app.errors import StartupError
+from app.lifting import NEIGHBOURS
 from library_store.backends import Backend
 from models import ProviderChoice
 
@@ -137,7 +138,7 @@ class Settings(BaseSettings):
     shortlist: int = Field(
         30,
         ge=1,
-        le=200,  # as many neighbours as are looked up
+        le=NEIGHBOURS,
         description="Exemplars per person that are resectioned (eq. 4's k).",
     )
     weights_dir: Path = Field(

@@ -1,6 +1,8 @@
-"""Cutting a square out of a photo and scaling it to the network's input, without aliasing."""
+"""Cutting a square out of a photo, scaling it to a network's input: without aliasing."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import cv2
 import numpy as np
@@ -57,3 +59,30 @@ def square_crop(
         borderValue=(border_grey,) * 3,
     )
     return np.asarray(crop, np.uint8), scale, origin
+
+
+def warped(
+    image: NDArray[Any],
+    matrix: NDArray[np.floating],
+    size: tuple[int, int],
+    *,
+    border: int = cv2.BORDER_CONSTANT,
+    value: tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> NDArray[Any]:
+    """``image`` (H, W, ...) after an affine map (2, 3) of its pixels, on a canvas ``size`` (w, h).
+
+    What shrinks to less than half is averaged over whole blocks first; cv2.warpAffine alone skips
+    pixels, whatever interpolation it is asked for.
+    """
+    height, width = image.shape[:2]
+    linear, shift = matrix[:, :2].astype(np.float64), matrix[:, 2].astype(np.float64)
+    shrink = min(int(1 / max(float(np.sqrt(abs(np.linalg.det(linear)))), 1e-6)), height, width)
+    if shrink >= 2:
+        rows, columns = height // shrink, width // shrink
+        window = image[: rows * shrink, : columns * shrink]
+        image = cv2.resize(window, (columns, rows), interpolation=cv2.INTER_AREA)
+        # Block b averages pixels whose centre is (b + 0.5) * shrink - 0.5.
+        shift = shift + linear.sum(1) * (shrink - 1) / 2
+        linear = linear * shrink
+    placed = np.concatenate([linear, shift[:, None]], axis=1)
+    return cv2.warpAffine(image, placed, size, borderMode=border, borderValue=value)

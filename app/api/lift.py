@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import time
+from collections import Counter
 
 import numpy as np
 from fastapi import APIRouter, Depends, Request, Response
@@ -13,7 +15,7 @@ from app.answers import lift_answer, rounded_timings
 from app.api.bodies import WatchedArrival, read_body
 from app.api.deps import EngineDep, ServiceDep, authorise, no_query
 from app.api.problems import describe, describe_ok, invalid_input
-from app.errors import MalformedBodyError
+from app.errors import InvalidInputError, MalformedBodyError
 from app.pipeline import LiftQuery
 from library_store.conversion import CONVERSIONS
 
@@ -73,11 +75,22 @@ async def lift_people(request: Request, service: ServiceDep, engine: EngineDep) 
 def parse_lift_request(body: bytes) -> schemas.LiftRequest:
     """The request in ``body``; ``MalformedBodyError`` or ``InvalidInputError`` when it is none."""
     try:
-        return schemas.LiftRequest.model_validate_json(body, strict=True)
+        wanted = schemas.LiftRequest.model_validate_json(body, strict=True)
     except ValidationError as error:
         if any(item["type"] == "json_invalid" for item in error.errors()):
             raise MalformedBodyError("the body is not JSON") from error
         raise invalid_input(error) from None
+    # Of such members pydantic takes the last and says nothing (RFC 8259: "unpredictable").
+    json.loads(body, object_pairs_hook=_refuse_twins, parse_int=str, parse_float=str)
+    return wanted
+
+
+def _refuse_twins(members: list[tuple[str, object]]) -> None:
+    """``InvalidInputError`` when an object of the body has two members of one name."""
+    names = [name for name, _ in members]
+    if len(set(names)) < len(names):
+        twice = [name for name, times in Counter(names).items() if times > 1]
+        raise InvalidInputError([(name, "given twice in one object") for name in twice])
 
 
 def query_of(wanted: schemas.LiftRequest) -> LiftQuery:

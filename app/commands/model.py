@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Annotated
@@ -33,6 +34,13 @@ Name = Annotated[
     str | None,
     typer.Argument(help="A card's name in POSEMATCH_WEIGHTS_DIR; default: all there are."),
 ]
+
+
+def _card_name(value: str | None) -> str | None:
+    """Refuse, before hours of training, what cannot be a file's name or asked for."""
+    if value is not None and (value == "auto" or not re.fullmatch(r"\w[\w.-]*", value)):
+        raise typer.BadParameter("letters, digits and . _ - are wanted, and not the word auto")
+    return value
 
 
 @commands.command("card")
@@ -116,7 +124,9 @@ def export(
     out: Annotated[Path, typer.Option(help="Directory for the ONNX file and its card.")],
     version: Annotated[str, typer.Option(help="Of the weights; users see it in every answer.")],
     kind: Annotated[str, typer.Option(help="cpm or person.")] = "cpm",
-    name: Annotated[str | None, typer.Option(help="Of the card; default the kind.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Of the card; default the kind.", callback=_card_name)
+    ] = None,
     input_px: Annotated[
         int | None, typer.Option(min=32, help="A multiple of 32; default as trained.")
     ] = None,
@@ -159,7 +169,7 @@ def finetune(
         int, typer.Option(min=1, help="Every so many frames of Human3.6M, which has 50 a second.")
     ] = 25,
     start: Annotated[str, typer.Option(help="Card to start from (fp32).")] = "cpm",
-    name: Annotated[str, typer.Option(help="Of the new card.")] = "finetuned",
+    name: Annotated[str, typer.Option(help="Of the new card.", callback=_card_name)] = "finetuned",
     steps: Annotated[int, typer.Option(min=1)] = 500,
     minutes: Annotated[float | None, typer.Option(min=0.1, help="End by then.")] = None,
     lr: Annotated[float, typer.Option(min=1e-7, max=1e-1, help="Learning rate.")] = 3e-4,
@@ -170,7 +180,7 @@ def finetune(
     """Train the pose network further on your own labelled images.
 
     Labels are a COCO keypoints file with the folder of its images, or Human3.6M as unpacked. Whole
-    images (clips) are held out and measured before and after. Needs the extra `train`.
+    images (takes) are held out and measured before and after. Needs the extra `train`.
 
     \b
     posematch model finetune --coco person_keypoints.json --images photos --out ours
@@ -227,7 +237,7 @@ def import_caffe(
         Path, typer.Argument(exists=True, dir_okay=False, help="pose_iter_*.caffemodel.")
     ],
     out: Annotated[Path, typer.Option(help="Directory for the ONNX file and its card.")],
-    name: Annotated[str, typer.Option(help="Of the card.")] = "cpm-original",
+    name: Annotated[str, typer.Option(help="Of the card.", callback=_card_name)] = "cpm-original",
     joints: Annotated[
         JointOrder,
         typer.Option(help="Order of its maps: cpm as published, or that of LSP or MPII."),

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from app.lifting import NEIGHBOURS
 from app.lifting.calibration import FUSION_SIGMA, SigmaCalibration
 from app.lifting.ensemble import place_ensemble
 from app.lifting.fusion import FusedPose, FusionSettings, fuse
@@ -71,7 +72,7 @@ class LiftingSettings:
 
     shortlist: int = 30
     paper_shortlist: int = 10
-    neighbours: int = 200
+    neighbours: int = NEIGHBOURS
     least_confidence: float = 0.2
     sigma_library_px: float = 30.0
     sigma_2d_px: float = 6.5

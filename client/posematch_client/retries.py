@@ -126,4 +126,8 @@ def parsed(response: httpx.Response) -> object:
     if response.is_success and body is not None:
         return body
     problem = body if isinstance(body, dict) else {}
+    if response.has_redirect_location and not problem:
+        # Not followed: every photo, and the key, would be sent twice.
+        there = response.headers["location"]
+        problem = {"detail": f"sent on to {there}: give the client that address"}
     raise RefusedError(response.status_code, problem, retry_after_s(response))

@@ -40,6 +40,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--cross-set", type=Path, help="with --data cmu: people of another set (lifting npz)")
     add("--noise-px", type=float, default=10.0, help="with --data cmu: what stands for a network")
     chosen = parser.parse_args(arguments)
+    for name in ("library", "mlp", "mocap", "cross_set"):
+        path: Path | None = getattr(chosen, name)
+        if path is not None and not path.exists():
+            parser.error(f"--{name.replace('_', '-')} {path} does not exist")
     options = Options(
         out=chosen.out,
         entries=chosen.entries or None,

@@ -61,6 +61,8 @@ def train(library: Library, width: int, n_blocks: int, minutes: float, seed: int
     """Train for so long and write ``out``, from time to time and at the end; returns samples."""
     import torch
 
+    from models.training.precision import mixed_precision
+
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     rng = np.random.default_rng(seed)
@@ -78,7 +80,7 @@ def train(library: Library, width: int, n_blocks: int, minutes: float, seed: int
             break
         for group in optimiser.param_groups:
             group["lr"] = 1e-3 * min(1.0, (step + 1) / 500, 1.6 * (1.0 - spent))
-        with torch.autocast("cpu", dtype=torch.bfloat16):
+        with mixed_precision("cpu"):
             found = forward(parameters, n_blocks, inputs)
         difference = found.float().view(-1, N_JOINTS, 3) - wanted
         loss = torch.sqrt((difference**2).sum(-1) + 1e-8).mean()

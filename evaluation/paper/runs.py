@@ -119,7 +119,7 @@ def run_users_data(root: Path, options: Options) -> bool:
             diagnostic=_diagnostic_set(test2, h36m, options),
             p1_library=_frames_library("h36m-p1", train1, options),
             p2_library=_frames_library("h36m-p2", train2, options),
-            x_is="the shipped pose network on the videos' frames, given the true box",
+            x_is="the pose network on the videos' frames, given the true box",
             by_action=True,
         )
         videos = find_videos(root) if h36m.real_cameras else {}

@@ -1,4 +1,4 @@
-"""2D from the photo: frames of Human3.6M's videos through the shipped pose network.
+"""2D from the photo: frames of Human3.6M's videos through the pose network that would serve.
 
 ``S*/Videos/<action>.<camera>.mp4`` shows the clip of that subject, action and camera, frame by
 frame. The network is given the box of the true joints, as the paper's is given the person.
@@ -43,8 +43,9 @@ def look_at_videos(views: Views, videos: dict[Key, Path]) -> tuple[Views, Seen2D
 
     ``ModelError`` when the network cannot be loaded.
     """
-    pose, _ = chosen_networks(load_settings())
-    estimator = PoseEstimator(pose)
+    settings = load_settings()
+    pose, _ = chosen_networks(settings)
+    estimator = PoseEstimator(pose, weights_dir=settings.weights_dir, provider=settings.provider)
     truth = views.points_px()
     missing: list[str] = []
     rows: list[int] = []

@@ -10,6 +10,7 @@ eleven clips of four people): thoraxes are not quite as long as upper backs.
 
 from __future__ import annotations
 
+import codecs
 import math
 import re
 from dataclasses import dataclass, replace
@@ -125,11 +126,17 @@ def parse(path: Path) -> BvhFile:
 
 
 def _text(path: Path) -> str:
-    """What a BVH file says, in UTF-8 as programs write it today, or in Latin-1 as older ones do."""
+    """What a BVH file says, in UTF-8 as programs write it today, or in Latin-1 as older ones do.
+
+    UTF-16, which Windows' editors call Unicode, is told by its byte order mark.
+    """
     content = path.read_bytes()
+    is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
+        text = content.decode("utf-16" if is_utf16 else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        if is_utf16:
+            raise MocapError(path, f"begins as UTF-16 text, but is none: {error.reason}") from error
         text = content.decode("latin-1")
     return text.replace("\r", "\n")
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from library_store.skeleton import LSP14
+from models.crop import warped
 from models.training.cutout import over, place, silhouette, whole
 from models.training.dataset import TORSO, Image, LabelledCrop
 
@@ -70,15 +71,7 @@ def _warp(
             rng.integers(3)
         ]
         value = tuple(rng.uniform(0, 255, 3)) if rng.random() < 0.5 else value
-    shrink = float(np.sqrt(abs(np.linalg.det(matrix[:, :2].astype(np.float64)))))
-    image = cv2.warpAffine(
-        crop.image,
-        matrix,
-        (size, size),
-        flags=cv2.INTER_AREA if shrink < 0.5 else cv2.INTER_LINEAR,
-        borderMode=border,
-        borderValue=value,
-    )
+    image = warped(crop.image, matrix, (size, size), border=border, value=value)
     joints = crop.joints_px @ matrix[:, :2].T + matrix[:, 2]
     weight, visible = crop.weight, crop.visible
     if flip:

@@ -2,7 +2,7 @@
 
 ``python -m models.training.calibrate --data DIR [--name cpm]`` runs on photos that training held
 out (whole photos, and the last crops of the labelled files): half of them fit, the other
-half check. Accuracy is that on lspet_val and on the held-out photos. All goes into the card.
+half check. Accuracy is that on ``--test`` and on the held-out photos. All goes into the card.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, default=WEIGHTS_DIR)
     parser.add_argument("--name", default="cpm")
     parser.add_argument("--train", default="lspet_train_a,lspet_train_b,photos_a,photos_b")
-    parser.add_argument("--test", default="lspet_val")
+    parser.add_argument("--test", default="lspet_val", help="measured too; several with commas")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--figure", type=Path, help="draw the reliability diagram here (PNG)")
     args = parser.parse_args()
@@ -188,8 +188,8 @@ def main() -> None:
     coverage = float(covered[check.labelled].mean())
 
     measured: dict[str, float | str] = dict(card.measured)
-    for name in ["lspet_val", "photos_dev"]:
-        if name not in kept:
+    for name in (*filter(None, args.test.split(",")), "photos_dev"):
+        if not kept[name]:
             continue
         data = read_all(model, output, [canonical(c, output.input_px) for c in kept[name]])
         measured[f"pck_0.2/{name}/14_joints"] = round(accuracy(data, tuple(range(14))), 4)

@@ -22,6 +22,7 @@ from library_store.skeleton import (
     R_SHOULDER,
     R_WRIST,
 )
+from models.crop import warped
 from models.training.dataset import Image, LabelledCrop
 
 Mask = NDArray[np.float32]
@@ -82,9 +83,7 @@ def place(
 ) -> tuple[Image, NDArray[np.float32]]:
     """An image on a canvas of ``size`` (w, h), and the (2, 3) affine that put it there."""
     matrix = np.array([[-scale if flip else scale, 0, shift[0]], [0, scale, shift[1]]])
-    flags = cv2.INTER_AREA if scale < 0.6 else cv2.INTER_LINEAR
-    placed = cv2.warpAffine(image, matrix, size, flags=flags, borderValue=tuple(fill))
-    return placed, matrix.astype(np.float32)
+    return warped(image, matrix, size, value=tuple(fill)), matrix.astype(np.float32)
 
 
 def over(image: Image, front: Image, mask: Mask) -> Image:

@@ -28,6 +28,7 @@ from library_store.skeleton import (
     R_HIP,
     R_SHOULDER,
 )
+from models.errors import AnnotationError
 
 MP33_LIMBS = (12, 14, 16, 11, 13, 15, 24, 26, 28, 23, 25, 27)
 """The teacher's landmarks for joints 2..13 of lsp14, in that order."""
@@ -73,9 +74,9 @@ class LabelledCrop:
         return bool((self.weight[list(TORSO)] > 0).all())
 
 
-def _members(path: Path) -> Iterator[tuple[str, bytes]]:
+def _files(path: Path) -> Iterator[tuple[str, bytes]]:
     if path.is_dir():
-        for file in sorted(path.iterdir()):
+        for file in sorted(file for file in path.rglob("*") if file.is_file()):
             yield file.name, file.read_bytes()
         return
     with tarfile.open(path) as tar:
@@ -85,16 +86,38 @@ def _members(path: Path) -> Iterator[tuple[str, bytes]]:
                 yield Path(member.name).name, stream.read()
 
 
-def _decode(data: bytes) -> Image:
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+def _members(path: Path) -> Iterator[tuple[str, bytes]]:
+    """Every file of a folder or tar by its bare name, whatever folders within it lies in."""
+    seen: set[str] = set()
+    for name, data in _files(path):
+        if name.startswith("."):  # what macOS puts beside files
+            continue
+        if name in seen:
+            raise AnnotationError(f"{path} has two files {name}: which is meant?")
+        seen.add(name)
+        yield name, data
+
+
+def _is_jpeg(name: str) -> bool:
+    return name.lower().endswith((".jpg", ".jpeg"))
+
+
+def _decode(path: Path, name: str, data: bytes) -> Image:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
     if image is None:
-        raise ValueError("a JPEG of the data set cannot be decoded")
+        raise AnnotationError(f"{path}: {name} is no JPEG that can be decoded")
     return image
 
 
 def decode_members(path: Path) -> dict[str, Image]:
-    """Every JPEG of a folder or tar, by name, (h, w, 3) uint8 BGR."""
-    return {name: _decode(data) for name, data in _members(path) if name.endswith(".jpg")}
+    """Every JPEG of a folder or tar, by name, (h, w, 3) uint8 BGR.
+
+    Raises ``AnnotationError`` when there is none, one that cannot be decoded, or a name twice.
+    """
+    images = {name: _decode(path, name, data) for name, data in _members(path) if _is_jpeg(name)}
+    if not images:
+        raise AnnotationError(f"{path} has no JPEG")
+    return images
 
 
 def _from_labels(record: dict[str, Any], image: Image, group: int) -> LabelledCrop | None:
@@ -173,19 +196,25 @@ def read_annotations(path: Path) -> list[dict[str, Any]]:
 
 
 def load(path: Path) -> list[LabelledCrop]:
-    """Read every usable crop of a folder or tar; crops with hardly any label are left out."""
+    """Read every usable crop of a folder or tar; crops with hardly any label are left out.
+
+    Raises ``AnnotationError`` for images that are missing or cannot be decoded.
+    """
     images: dict[str, bytes] = {}
     annotations: dict[str, Any] | None = None
     for name, data in _members(path):
         if name == "annotations.json":
             annotations = json.loads(data)
-        elif name.endswith(".jpg"):
+        elif _is_jpeg(name):
             images[name] = data
     if annotations is None:
         raise FileNotFoundError(f"{path} has no annotations.json")
     crops: list[LabelledCrop] = []
     for i, record in enumerate(annotations["images"]):
-        image = _decode(images[record["image"]])
+        name = record["image"]
+        if name not in images:
+            raise AnnotationError(f"{path}: annotations.json names {name}, which is not there")
+        image = _decode(path, name, images[name])
         by_hand = "labelled" in record
         crop = _from_labels(record, image, i) if by_hand else _from_teachers(record, image)
         if crop is not None:
@@ -209,17 +238,19 @@ def read_crops(
     """Training crops, and by name the held-out ones that errors can be measured on.
 
     Comma-separated names of tars in ``folder``, or paths, without ".tar"; ``name*2`` is drawn
-    twice as often. Files called rendered* are trained on whole but for a few.
+    twice as often. Files called lspet* and rendered* are trained on whole but for their last crops,
+    of others one photo in ``HOLD_OUT_ONE_IN`` is held out.
     """
     crops: list[LabelledCrop] = []
     kept: dict[str, list[LabelledCrop]] = {"photos_dev": [], "labelled_dev": []}
     for item in train.split(","):
         name, _, times = item.partition("*")
         loaded = load(folder / f"{name}.tar")
-        if name.startswith("lspet"):
-            kept["labelled_dev"] += [c for c in loaded[-DEV_LABELLED:] if c.has_torso]
+        kind = Path(name).name
+        if kind.startswith("lspet"):
+            kept["labelled_dev"] += loaded[-DEV_LABELLED:]
             used = loaded[:-DEV_LABELLED]
-        elif Path(name).name.startswith("rendered"):
+        elif kind.startswith("rendered"):
             kept.setdefault("rendered_dev", []).extend(loaded[-DEV_RENDERED:])
             used = loaded[:-DEV_RENDERED]
         else:
@@ -228,4 +259,4 @@ def read_crops(
         crops += used * int(times or 1)
     for name in filter(None, test.split(",")):
         kept[name] = load(folder / f"{name}.tar")
-    return crops, kept
+    return crops, {name: [c for c in those if c.has_torso] for name, those in kept.items()}

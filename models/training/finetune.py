@@ -1,6 +1,6 @@
 """Going on from the shipped weights with a user's own labelled people: see :func:`finetune`.
 
-Behind ``posematch model finetune``. A share of the images (whole images, whole clips) is held out,
+Behind ``posematch model finetune``. A share of the images (whole images, whole takes) is held out,
 measured before and after through the files that are served.
 """
 
@@ -62,7 +62,7 @@ class FinetuneResult:
 def split(
     crops: list[LabelledCrop], share: float, seed: int
 ) -> tuple[list[LabelledCrop], list[LabelledCrop]]:
-    """(train, held out); people of one image or clip stay together.
+    """(train, held out); people of one image or take stay together.
 
     Raises ``AnnotationError`` when either part would be too small.
     """
@@ -73,7 +73,7 @@ def split(
     train = [c for c in crops if c.group not in kept]
     if len(held) < LEAST_HELD or len(train) < LEAST_TRAINED:
         raise AnnotationError(
-            f"{len(crops)} labelled people in {len(groups)} images or clips leave {len(train)} to "
+            f"{len(crops)} labelled people in {len(groups)} images or takes leave {len(train)} to "
             f"train on and {len(held)} with shoulders and hips to measure on; at least "
             f"{LEAST_TRAINED} and {LEAST_HELD} are needed: label more images, or change --hold-out"
         )
@@ -120,6 +120,10 @@ def finetune(
     if not isinstance(output, PoseOutput) or before_card.precision != "fp32":
         raise ModelError(f"model {start} cannot be trained on: name an fp32 pose network's card")
     path = weights_dir / before_card.file
+    if path.resolve() == (out / f"{name}.onnx").resolve():
+        raise ModelError(
+            f"{out} is where {start} lies, which would be overwritten: give another --name or --out"
+        )
     try:
         config = config_of(read_weights(path))
     except KeyError as error:
@@ -200,7 +204,7 @@ def _inputs(crops: list[LabelledCrop], start: ModelCard, settings: FinetuneSetti
     """Digest of what decides who is held out and what is learned, but for how long."""
     digest = hashlib.sha256(f"{start.sha256} {settings.hold_out} {settings.seed}".encode())
     for crop in crops:
-        digest.update(crop.name.encode())
+        digest.update(f"{crop.name} {crop.group}".encode())
         for part in (crop.image, crop.joints_px, crop.visible):
             digest.update(part.tobytes())
     return digest.hexdigest()

@@ -61,14 +61,9 @@ def quantized(path: Path, images: Images) -> onnx.ModelProto:
     """The network of an fp32 file in 8 bits; ``images`` (h, w, 3) uint8 BGR are as it gets them."""
     with tempfile.TemporaryDirectory() as folder:
         folded, out = Path(folder) / "folded.onnx", Path(folder) / "int8.onnx"
-        options = ort.SessionOptions()
-        options.log_severity_level = 3
-        # Normalisations have to be part of their convolutions before ranges are taken.
-        options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
-        options.optimized_model_filepath = str(folded)
-        ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        fold(path, folded)
         model = onnx.load(str(folded))
-        centred = _take_blocks(model)
+        centred = take_blocks(model)
         onnx.save(model, str(folded))
         with _quiet():
             quantize_static(
@@ -99,7 +94,19 @@ def quantized(path: Path, images: Images) -> onnx.ModelProto:
     return model
 
 
-def _take_blocks(model: onnx.ModelProto) -> str:
+def fold(path: Path, folded: Path) -> None:
+    """Write a network with its normalisations made part of their convolutions.
+
+    Ranges are to be taken of what is left then.
+    """
+    options = ort.SessionOptions()
+    options.log_severity_level = 3
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    options.optimized_model_filepath = str(folded)
+    ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+
+
+def take_blocks(model: onnx.ModelProto) -> str:
     """Let the stem read 4x4 blocks as 48 channels, in place; the name of its input.
 
     To 8-bit kernels, which gather their input pixel by pixel, that is worth half the stem's time.
@@ -232,7 +239,10 @@ def quantize(directory: Path, name: str, images: Images) -> ModelCard:
 
 
 def same_boxes(directory: Path, names: tuple[str, str], photos: Images) -> float:
-    """Share of the people found by both of two person networks (IoU over 0.5), of all found."""
+    """Share of the people found by both of two person networks (IoU over 0.5), of all found.
+
+    1 where neither finds anybody.
+    """
     first, second = (PersonDetector(name, weights_dir=directory) for name in names)
     both = total = 0
     for photo in photos:
@@ -244,7 +254,7 @@ def same_boxes(directory: Path, names: tuple[str, str], photos: Images) -> float
         matched = int((iou(*boxes).max(1) > 0.5).sum()) if some else 0
         both += matched
         total += len(boxes[0]) + len(boxes[1]) - matched
-    return both / total
+    return both / total if total else 1.0
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
+from models.crop import warped
 from models.person_detector import iou
 from models.training.dataset import Image
 
@@ -75,7 +76,7 @@ class BlazePose:
                 [0, scale, (DETECTOR_SIZE - h * scale) / 2],
             ]
         )
-        square = cv2.warpAffine(image, matrix, (DETECTOR_SIZE, DETECTOR_SIZE), flags=cv2.INTER_AREA)
+        square = warped(image, matrix, (DETECTOR_SIZE, DETECTOR_SIZE))
         x = square[None, :, :, ::-1].astype(np.float32) / 127.5 - 1
         outputs = self._detector.run(None, {self._detector.get_inputs()[0].name: x})
         raw = next(o for o in outputs if o.shape[-1] == 12)[0]

@@ -1,6 +1,7 @@
 """Train the CPM: ``python -m models.training.train --data DIR --out DIR``.
 
-Runs on a CPU (in bf16) or a GPU, resumes by itself, is seeded and logs its metrics: see loop.py.
+Runs on a CPU or a GPU (in bf16 where that is native), resumes by itself, is seeded and logs its
+metrics: see loop.py.
 """
 
 from __future__ import annotations

@@ -8,13 +8,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
+from models.crop import warped
 from models.person_detector import decode, iou
 from models.training import loop
 from models.training.crowds import calm_patches, crowd
@@ -142,9 +142,7 @@ def main() -> None:
         for scene in dev:
             h, w = scene.image.shape[:2]
             fit = min(width / w, height / h)
-            small = cv2.warpAffine(
-                scene.image, np.array([[fit, 0, 0], [0, fit, 0]]), canvas, flags=cv2.INTER_AREA
-            )
+            small = warped(scene.image, np.array([[fit, 0, 0], [0, fit, 0]]), canvas)
             x = torch.from_numpy(small).permute(2, 0, 1)[None].float() / 127.5 - 1
             with torch.no_grad():
                 out = model(x.to(args.device))[0].cpu().numpy()

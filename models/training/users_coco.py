@@ -3,8 +3,10 @@
 Keypoints are taken by their names in ``categories[*].keypoints``: shoulders, elbows, wrists, hips,
 knees and ankles with ``left_``/``right_`` (or ``l_``/``r_``) before them, and ``neck`` and
 ``head_top`` where there are any; others (eyes, ears, toes) are left out, and so are categories
-without these limbs. Visibility is COCO's: 0 not labelled, 1 labelled but hidden, 2 seen. Pixels are
-those of the stored file, whatever its EXIF orientation says.
+without these limbs. Visibility is COCO's: 0 not labelled, 1 labelled but hidden, 2 seen; null and
+NaN, which some tools write for what is not labelled, are taken for 0. Pixels are those of the
+stored file; of the photo turned upright, as its EXIF orientation says, where only that has the size
+which the file of labels states (phones' photos in tools that show them upright).
 """
 
 from __future__ import annotations
@@ -12,14 +14,13 @@ from __future__ import annotations
 import codecs
 import re
 from pathlib import Path
-from typing import Annotated
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, ValidationError
 
-from library_store.skeleton import LSP14
+from library_store.skeleton import LSP14, NECK
 from models.crop import square_crop
 from models.errors import AnnotationError
 from models.training.dataset import Image, LabelledCrop
@@ -43,13 +44,13 @@ class _Annotation(BaseModel):
     id: int | None = None
     image_id: int
     category_id: int
-    keypoints: list[Annotated[float, Field(allow_inf_nan=False)]] = []
-    iscrowd: int = 0
+    keypoints: list[float | None] | None = None
+    iscrowd: int | None = None
 
 
 class _Category(BaseModel):
     id: int
-    keypoints: list[str] = []
+    keypoints: list[str] | None = None
 
 
 class _Coco(BaseModel):
@@ -59,14 +60,20 @@ class _Coco(BaseModel):
 
 
 def read_coco(annotations: Path, images: Path) -> list[LabelledCrop]:
-    """Every person with at least six labelled joints, grouped by image.
+    """Every person with at least six labelled joints, grouped by image file.
 
     Raises ``AnnotationError`` at the first thing that makes the labels doubtful: a record that is
     not COCO's, an image that is missing or of another size, coordinates that cannot be pixels.
     """
     coco = _parse(annotations)
-    columns = _columns_by_category(annotations, coco)
-    if not columns:
+    joints = _joints_by_category(annotations, coco)
+    if not joints and any(record.keypoints for record in coco.annotations):
+        raise AnnotationError(
+            f"{annotations}: people have keypoints, but no category says in "
+            "categories[*].keypoints what each is called: add their names, like left_shoulder, in "
+            "their order"
+        )
+    if not joints:
         raise AnnotationError(
             f"{annotations}: no category has keypoints; is it a file of boxes only? "
             "person_keypoints_*.json is wanted"
@@ -81,13 +88,16 @@ def read_coco(annotations: Path, images: Path) -> list[LabelledCrop]:
     people: dict[int, list[tuple[str, NDArray[np.float64]]]] = {}
     for index, record in enumerate(coco.annotations):
         name = f"annotation {index if record.id is None else record.id}"
-        if record.iscrowd or record.category_id not in columns or not any(record.keypoints):
+        if record.iscrowd or record.category_id not in joints:
+            continue
+        keypoints = np.array(record.keypoints or [], np.float64)
+        if not np.nan_to_num(keypoints).any():
             continue
         if record.image_id not in files:
             raise AnnotationError(
                 f"{annotations}: {name} is of image {record.image_id}, which is not among images"
             )
-        points = _points(annotations, name, record, columns[record.category_id])
+        points = _points(annotations, name, keypoints, joints[record.category_id])
         if (points[:, 2] > 0).sum() >= LEAST_JOINTS:
             people.setdefault(record.image_id, []).append((name, points))
     if not people:
@@ -95,11 +105,15 @@ def read_coco(annotations: Path, images: Path) -> list[LabelledCrop]:
             f"{annotations}: nobody has {LEAST_JOINTS} labelled joints or more; nothing to learn"
         )
     crops = []
+    groups: dict[str, int] = {}
     for image_id, persons in sorted(people.items()):
-        pixels = _read_image(annotations, images, files[image_id])
+        file = files[image_id]
+        # Merged sets have files twice: whoever is held out must not be trained on under another id.
+        group = groups.setdefault(file.file_name, image_id)
+        pixels = _read_image(annotations, images, file)
         for name, points in persons:
             _check_points(annotations, name, points, pixels)
-            crops.append(cut_out(f"{files[image_id].file_name}/{name}", image_id, pixels, points))
+            crops.append(cut_out(f"{file.file_name}/{name}", group, pixels, points))
     return crops
 
 
@@ -139,14 +153,14 @@ def _parse(path: Path) -> _Coco:
         ) from None
 
 
-def _columns_by_category(path: Path, coco: _Coco) -> dict[int, dict[int, int]]:
-    """By category, which keypoint is which joint; those that are no people (dogs) left out."""
-    found: dict[int, dict[int, int]] = {}
+def _joints_by_category(path: Path, coco: _Coco) -> dict[int, list[int | None]]:
+    """By category, which joint each keypoint is; those that are no people (dogs) left out."""
+    found: dict[int, list[int | None]] = {}
     problems: list[AnnotationError] = []
     for category in coco.categories:
         if category.keypoints:
             try:
-                found[category.id] = _columns(path, category)
+                found[category.id] = _joints(path, category.id, category.keypoints)
             except AnnotationError as error:
                 problems.append(error)
     if problems and not found:
@@ -154,50 +168,55 @@ def _columns_by_category(path: Path, coco: _Coco) -> dict[int, dict[int, int]]:
     return found
 
 
-def _columns(path: Path, category: _Category) -> dict[int, int]:
-    """Which keypoint of a category is which lsp14 joint."""
-    columns: dict[int, int] = {}
-    for column, raw in enumerate(category.keypoints):
+def _joints(path: Path, category: int, names: list[str]) -> list[int | None]:
+    """Which lsp14 joint each keypoint of a category is, None for those that are none."""
+    joints: list[int | None] = []
+    for raw in names:
         name = re.sub(r"[\s\-]+", "_", raw.strip().lower())
         limb = _LIMB.fullmatch(name)
         joint = f"{limb[1][0]}_{limb[2]}" if limb else _HEAD.get(name)
-        if joint is None:
-            continue
-        index = LSP14.joint_names.index(joint)
-        if index in columns.values():
+        index = None if joint is None else LSP14.joint_names.index(joint)
+        if index is not None and index in joints:
             raise AnnotationError(
-                f"{path}: category {category.id} has two keypoints for {joint}: which is it?"
+                f"{path}: category {category} has two keypoints for {joint}: which is it?"
             )
-        columns[column] = index
-    limbs = {LSP14.joint_names[j] for j in columns.values()} - {"head_top", "neck"}
-    missing = sorted(set(LSP14.joint_names[2:]) - limbs)
+        joints.append(index)
+    missing = sorted(
+        name for j, name in enumerate(LSP14.joint_names) if j > NECK and j not in joints
+    )
     if missing:
         raise AnnotationError(
-            f"{path}: category {category.id} lacks the keypoints {', '.join(missing)}; it has "
-            f"{', '.join(category.keypoints)}. Rename them like left_shoulder"
+            f"{path}: category {category} lacks the keypoints {', '.join(missing)}; it has "
+            f"{', '.join(names)}. Rename them like left_shoulder"
         )
-    return columns
+    return joints
 
 
 def _points(
-    path: Path, name: str, record: _Annotation, columns: dict[int, int]
+    path: Path, name: str, values: NDArray[np.float64], joints: list[int | None]
 ) -> NDArray[np.float64]:
     """(14, 3): x, y, visibility."""
-    values = np.array(record.keypoints, np.float64)
-    if len(values) % 3 or len(values) // 3 <= max(columns):
+    if len(values) != 3 * len(joints):
         raise AnnotationError(
             f"{path}: {name} has {len(values)} numbers in keypoints, wanted are x, y, visibility "
-            "for each keypoint of its category"
+            f"for each of its category's {len(joints)} keypoints"
         )
     triples = values.reshape(-1, 3)
-    if not np.isin(triples[:, 2], (0, 1, 2)).all():
+    visibility = np.nan_to_num(triples[:, 2])
+    if not np.isin(visibility, (0, 1, 2)).all():
         raise AnnotationError(
             f"{path}: {name} has a visibility that is not 0, 1 or 2: keypoints are x, y, "
             "visibility; confidences have to be made into labels first"
         )
+    labelled = visibility > 0
+    if not np.isfinite(triples[labelled]).all():
+        raise AnnotationError(
+            f"{path}: {name} has a keypoint with a visibility over 0, but its x or y is no number"
+        )
     points = np.zeros((LSP14.n_joints, 3))
-    for column, joint in columns.items():
-        points[joint] = triples[column]
+    for joint, triple in zip(joints, np.where(labelled[:, None], triples, 0.0), strict=True):
+        if joint is not None:
+            points[joint] = triple
     return points
 
 
@@ -208,17 +227,21 @@ def _read_image(annotations: Path, folder: Path, record: _Image) -> Image:
             f"{annotations}: image {record.id} is {path}, which does not exist; "
             "is this the folder that file_name is relative to?"
         )
-    pixels = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if pixels is None:
-        raise AnnotationError(f"{path} is no image that can be decoded")
-    height, width = pixels.shape[:2]
-    stated = record.width or width, record.height or height
-    if stated != (width, height):
-        raise AnnotationError(
-            f"{path} is {width}x{height} px, but {annotations} labelled an image of "
-            f"{stated[0]}x{stated[1]}: it was resized or turned since"
-        )
-    return np.asarray(pixels, np.uint8)
+    sizes = []
+    for way in (cv2.IMREAD_IGNORE_ORIENTATION, 0):
+        pixels = cv2.imread(str(path), cv2.IMREAD_COLOR | way)
+        if pixels is None:
+            raise AnnotationError(f"{path} is no image that can be decoded")
+        height, width = pixels.shape[:2]
+        stated = record.width or width, record.height or height
+        if stated == (width, height):
+            return np.asarray(pixels, np.uint8)
+        sizes.append((width, height))
+    raise AnnotationError(
+        f"{path} is {sizes[0][0]}x{sizes[0][1]} px, but {annotations} labelled an image of "
+        f"{record.width or sizes[0][0]}x{record.height or sizes[0][1]}: it was resized or turned "
+        "since"
+    )
 
 
 def _check_points(path: Path, name: str, points: NDArray[np.float64], pixels: Image) -> None:

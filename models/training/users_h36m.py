@@ -33,10 +33,12 @@ VISIBLE = 2
 def read_human36m(
     root: Path, subjects: tuple[str, ...] = (), frames_apart: int = FRAMES_APART
 ) -> list[LabelledCrop]:
-    """Every ``frames_apart``-th frame of every clip, grouped by clip.
+    """Every ``frames_apart``-th frame of every clip, grouped by take.
 
-    ``subjects`` (S1, S5, ...) default to all there are. Raises ``AnnotationError`` when a clip has
-    no video, or one of other length, or when there is no clip at all.
+    A take is what several cameras filmed at once: the same poses, of which one may not be held out
+    while another is trained on. ``subjects`` (S1, S5, ...) default to all there are. Raises
+    ``AnnotationError`` when a clip has no video, or one of other length, and when one of the
+    subjects, or anybody at all, has no clip.
     """
     folders = sorted(path for path in root.glob(f"S*/{FEATURES}") if path.is_dir())
     clips = sorted(
@@ -46,13 +48,18 @@ def read_human36m(
         for file in folder.iterdir()
         if file.suffix in {".cdf", ".npz"}
     )
-    if not clips:
+    missing = sorted(set(subjects) - {clip.parents[2].name for clip in clips})
+    if missing or not clips:
         raise AnnotationError(
             f"{root}: no {FEATURES}/*.cdf or *.npz in a folder "
-            f"{' or '.join(subjects) or 'S1, S5, ...'}; unpack Human3.6M's archives there"
+            f"{' or '.join(missing) or 'S1, S5, ...'}; unpack Human3.6M's archives there"
         )
     crops = []
-    for group, clip in enumerate(clips):
+    takes: dict[tuple[Path, str], int] = {}
+    for clip in clips:
+        group = takes.setdefault(
+            (clip.parent, clip.stem.rpartition(".")[0] or clip.stem), len(takes)
+        )
         video = clip.parents[2] / VIDEOS / f"{clip.stem}.mp4"
         if not video.is_file():
             raise AnnotationError(f"{clip}: its video {video} is missing")

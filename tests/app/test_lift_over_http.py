@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from typing import Any
 
@@ -52,6 +53,24 @@ def root_relative_error_mm(person: dict[str, Any], render: Render) -> float:
     found = found - found[hips].mean(axis=0)
     truth = truth - truth[hips].mean(axis=0)
     return float(np.linalg.norm(found - truth, axis=1).mean())
+
+
+@pytest.mark.parametrize(
+    ("once", "twice", "name"),
+    [
+        ('"people":', '"people": [], "people":', "people"),
+        ('"x_px":', '"x_px": 1.0, "x_px":', "x_px"),
+        ('"width_px":', '"width_px": 1, "width_px":', "width_px"),
+        ('"name":', '"na\\u006de": "neck", "name":', "name"),
+    ],
+)
+def test_members_given_twice_are_refused(
+    server: Server, renders: list[Render], once: str, twice: str, name: str
+) -> None:
+    body = json.dumps(request_of(renders[0])).replace(once, twice, 1)
+    response = server.client.post("/v1/lift", content=body)
+    (error,) = problem(response, 422, "invalid-input")["errors"]
+    assert error == {"where": name, "message": "given twice in one object"}
 
 
 def test_true_joints_give_nearly_the_true_pose(server: Server, renders: list[Render]) -> None:

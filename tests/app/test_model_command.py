@@ -117,3 +117,23 @@ def test_without_the_extra_training_says_what_to_install(
     result = invoke(command, *arguments)
     assert isinstance(result.exception, ModelError), result.output
     assert "pip install 'posematch[train]'" in str(result.exception)
+
+
+@pytest.mark.parametrize("name", ["a/b", "..", "auto", ""])
+def test_a_name_that_no_card_can_have_is_refused_before_anything_is_done(
+    tmp_path: Path, name: str
+) -> None:
+    files = [tmp_path / "in.json", tmp_path / "in.prototxt", tmp_path / "in.caffemodel"]
+    for file in files:
+        file.touch()
+    coco, prototxt, caffemodel = files
+    out = tmp_path / "out"
+    for command in (
+        ("finetune", "--coco", coco, "--images", tmp_path, "--out", out),
+        ("export", coco, "--version", "1", "--out", out),
+        ("import-caffe", prototxt, caffemodel, "--out", out),
+    ):
+        result = invoke(*command, "--name", name)
+        assert result.exit_code == 2
+        assert "are wanted, and not the word auto" in " ".join(result.output.split())
+    assert not out.exists()

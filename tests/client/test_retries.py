@@ -127,6 +127,13 @@ def test_a_proxy_without_a_problem(way: str) -> None:
 
 
 @both_ways
+def test_a_redirect_says_where_to(way: str) -> None:
+    moved = httpx.Response(308, headers={"Location": "https://service/v1/poses"})
+    with pytest.raises(RefusedError, match="308: sent on to https://service/v1/poses: give"):
+        ask(Script(moved), QUICK, way)
+
+
+@both_ways
 def test_a_proxy_that_lost_its_replica(way: str) -> None:
     lost = httpx.Response(500, headers={"Content-Type": "text/plain"}, content="Internal error")
     script = Script(lost, lost)

@@ -15,6 +15,7 @@ from app.errors import RequestError
 from app.licences_table import END, START, renewed
 from app.main import create_app
 from app.settings import ENV_PREFIX, Settings
+from models.providers import PACKAGES
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "client" / "README.md"]
@@ -147,3 +148,9 @@ def test_headings_do_not_jump() -> None:
         levels = [len(marks) for marks in re.findall(r"^(#+) ", text, re.MULTILINE)]
         assert levels[0] == 1, page
         assert all(deeper - level <= 1 for level, deeper in pairwise(levels)), page
+
+
+def test_the_packages_of_all_providers_are_where_the_refusal_sends_to() -> None:
+    operations = (ROOT / "docs" / "operations.md").read_text()
+    for package in PACKAGES.values():
+        assert re.search(rf"pip (un)?install {package}`|`{package}`", operations), package

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from models.crop import square_crop
+from models.crop import square_crop, warped
 
 
 def ramp(height: int, width: int) -> np.ndarray:
@@ -58,3 +58,26 @@ def test_beyond_the_photo_is_the_grey_asked_for() -> None:
     crop, _, _ = square_crop(np.full((20, 20, 3), 200, np.uint8), (9.5, 9.5), 40, 40, 128)
     assert (crop[:5] == 128).all()
     assert (crop[15:25, 15:25] == 200).all()
+
+
+@pytest.mark.parametrize("scale", [1.7, 0.8, 0.45, 0.21, 0.06])
+@pytest.mark.parametrize("flip", [False, True])
+def test_what_is_warped_lies_where_the_matrix_says(scale: float, flip: bool) -> None:
+    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    linear = scale * turn @ np.diag([-1.0 if flip else 1.0, 1.0])
+    middle = np.array([127.3, 90.6])
+    matrix = np.column_stack([linear, (60.2, 61.7) - linear @ middle])
+    y, x = np.mgrid[0:200, 0:240]
+    spread_px = min(20.0, 12.0 / scale)  # all of it on the canvas
+    blob = np.exp(-((x - middle[0]) ** 2 + (y - middle[1]) ** 2) / (2 * spread_px**2))
+    found = warped(blob.astype(np.float32), matrix, (120, 110))
+    rows, columns = np.mgrid[0:110, 0:120]
+    at = np.array([(columns * found).sum(), (rows * found).sum()]) / found.sum()
+    np.testing.assert_allclose(at, (60.2, 61.7), atol=0.02 / min(scale, 1))
+
+
+def test_warping_averages_instead_of_skipping() -> None:
+    """What cv2.warpAffine does not do, also when it is asked for INTER_AREA."""
+    noise = np.random.default_rng(0).integers(0, 256, (400, 400, 3)).astype(np.uint8)
+    small = warped(noise, np.array([[0.125, 0, 0], [0, 0.125, 0]]), (50, 50))
+    assert float(small[2:-2, 2:-2].std()) < 1.2 * float(noise.std()) / 8

@@ -53,7 +53,7 @@ LSP14_BONES = (
 
 @dataclass(frozen=True)
 class Shape:
-    """What a person is built like, each value 0..1 except ``age`` in years."""
+    """What a person is built like, each value 0..1 except the age."""
 
     female: float
     age_years: float
@@ -222,7 +222,7 @@ def _read_obj(path: Path) -> tuple[Floats, Ints, NDArray[np.int8], dict[str, Int
             if group.startswith("joint-"):
                 cubes.setdefault(group, set()).update(corners)
             elif group in _KIND_OF_GROUP:
-                quads.append((corners * 2)[:4] if len(corners) == 4 else [*corners, corners[-1]])
+                quads.append(corners if len(corners) == 4 else [*corners, corners[-1]])
                 kinds.append(_KIND_OF_GROUP[group])
     return (
         np.array(vertices, np.float32) * METRES_PER_UNIT,

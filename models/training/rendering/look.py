@@ -112,7 +112,7 @@ def _cloth_color(rng: np.random.Generator) -> Floats:
 
 @dataclass(frozen=True)
 class Fabric:
-    """A colour as a function of the place; ``kind`` plain, rings, stripes, checks, print, photo."""
+    """A colour by place; ``kind`` plain, rings, stripes, checks, blotches or photo."""
 
     kind: str
     first: Floats

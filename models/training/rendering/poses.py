@@ -51,7 +51,7 @@ class PoseSource:
             poses = poses[~near]
         self.poses = poses
         cv2.setRNGSeed(0)
-        shape = _heading_free(poses)[:, :, :].reshape(len(poses), -1)
+        shape = _heading_free(poses).reshape(len(poses), -1)
         clusters = min(clusters, len(poses))
         some = shape[:: max(len(shape) // 12000, 1)].astype(np.float32)
         criteria = (cv2.TERM_CRITERIA_MAX_ITER, 12, 0.0)

@@ -319,7 +319,7 @@ def _visible(joints: Floats, xy: Floats, seen: Pixels, size: int) -> NDArray[np.
 def _finish(
     rng: np.random.Generator, canvas: Floats, photos: Backgrounds, size: int
 ) -> tuple[Image, tuple[int, int, int, int] | None]:
-    """Reduce, occlude, blur, add noise and JPEG; also the occluder's box (x0, y0, x1, y1)."""
+    """Reduce, occlude, blur and add noise; also the occluder's box (x0, y0, x1, y1)."""
     image = _resized(np.clip(canvas, 0, 1), size)
     hidden = None
     if rng.random() < 0.08:

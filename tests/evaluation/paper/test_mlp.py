@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -78,6 +79,23 @@ def test_compare_prints_every_method(
     assert "other poses" not in printed
     for method in ("paper", "default", "MLP", "MLP, warped"):
         assert printed.count(f"| {method} |") == 2
+
+
+def test_training_is_in_bf16_only_where_that_is_quick(
+    library: Library, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch = pytest.importorskip("torch", reason="of the extra train")
+    from models.training.precision import has_bf16
+
+    real, seen = mlp.forward, set()
+
+    def noted(*arguments: Any) -> Any:
+        seen.add(torch.is_autocast_enabled("cpu"))
+        return real(*arguments)
+
+    monkeypatch.setattr(mlp, "forward", noted)
+    mlp.train(library, 8, 1, 0.01, 0, tmp_path / "mlp.npz")
+    assert seen == {has_bf16("cpu")}
 
 
 def test_training_learns_and_both_forwards_agree(library: Library, tmp_path: Path) -> None:

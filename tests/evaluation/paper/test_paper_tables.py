@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +15,13 @@ from evaluation.paper.datasets import find_cmu, find_h36m, find_humaneva, h36m_c
 from evaluation.paper.exemplars import exemplars_of, fraction, orbit_rows, write_library
 from evaluation.paper.published import ACTIONS, P1, P1_GT, P2
 from evaluation.paper.systems import Seen2D, known_depths, optimal_exemplars, paper_method
+from evaluation.paper.videos import find_videos, look_at_videos
 from evaluation.paper.views import draw, look
 from library_store.cameras import rotations
 from library_store.importers import Clip, write_npz
 from library_store.importers.h36m import H36M_32
 from library_store.importers.rotation import up_to_y
+from models.card import WEIGHTS_DIR
 from tests.evaluation.paper.made_data import (
     DISTANCE_MM,
     acting,
@@ -78,6 +82,32 @@ def test_an_empty_folder_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[s
     with pytest.raises(SystemExit, match="no table can be made"):
         main(["--data", str(tmp_path), "--out", str(tmp_path / "out")])
     assert "Human3.6M: no data_3d_h36m.npz" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("option", ["--library", "--mlp", "--mocap", "--cross-set"])
+def test_a_file_that_is_not_there_is_named_at_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
+) -> None:
+    """Not after the hours that the tables before take."""
+    mocap = tmp_path / "cmu.npz"
+    mocap.touch()
+    with pytest.raises(SystemExit):
+        main(["--data", "cmu", "--mocap", str(mocap), option, str(tmp_path / "none")])
+    assert f"{option} {tmp_path / 'none'} does not exist" in capsys.readouterr().err
+
+
+def test_videos_are_seen_by_the_network_of_the_settings(
+    users_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("cpm.onnx", "person.onnx", "person.json"):
+        shutil.copy(WEIGHTS_DIR / name, tmp_path)
+    card = json.loads((WEIGHTS_DIR / "cpm.json").read_text())
+    (tmp_path / "ours.json").write_text(json.dumps(card | {"name": "ours"}))
+    monkeypatch.setenv("POSEMATCH_WEIGHTS_DIR", str(tmp_path))
+    monkeypatch.setenv("POSEMATCH_MODEL", "ours")
+    views = look(find_h36m(users_folder).of(["S11"]), seconds_apart=1.0)
+    shown, seen, _ = look_at_videos(views, find_videos(users_folder))
+    assert len(shown) == len(seen.points_px) > 0
 
 
 def test_a_clip_beyond_use_costs_only_itself(tmp_path: Path) -> None:

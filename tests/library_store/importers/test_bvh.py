@@ -157,6 +157,20 @@ def test_names_in_any_script(tmp_path: Path) -> None:
     assert "Köper" in {joint.name for joint in parse(path).joints}
 
 
+@pytest.mark.parametrize("codec", ["utf-16-le", "utf-16-be"])
+def test_utf_16_as_windows_editors_save_it(tmp_path: Path, codec: str) -> None:
+    path = tmp_path / "chain.bvh"
+    text = ("\ufeff" + CHAIN.replace("ROOT a", "ROOT 体")).encode(codec)
+    path.write_bytes(text)
+    found = parse(path)
+    assert found.joints[0].name == "体"
+    plain_file = parse(write(tmp_path / "plain.bvh", CHAIN))
+    assert_allclose(world_positions(found), world_positions(plain_file))
+    path.write_bytes(text[:-1])
+    with pytest.raises(MocapError, match="begins as UTF-16 text, but is none: truncated"):
+        parse(path)
+
+
 def test_a_frame_rate_is_the_files_where_the_name_is_not_cmus(tmp_path: Path) -> None:
     text = cmu_bvh(walk()).replace("Frame Time: .0083333", "Frame Time: 0.04")
     (clip,) = read(write(tmp_path / "dance.bvh", text))

@@ -6,7 +6,7 @@ import numpy as np
 
 from library_store.skeleton import LSP14
 from models.training.crowds import Member, calm_patches, crowd
-from models.training.cutout import silhouette, whole
+from models.training.cutout import place, silhouette, whole
 from models.training.dataset import LabelledCrop
 from models.training.scenes import LabelledScene
 
@@ -105,3 +105,9 @@ def test_calm_patches_keep_away_from_people() -> None:
     patches = calm_patches([marked] * 5, np.random.default_rng(0))
     assert patches
     assert all(patch.max() == 0 for patch in patches)
+
+
+def test_people_far_away_are_averaged_as_the_detector_sees_them() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (400, 400, 3)).astype(np.uint8)
+    placed, _ = place(noise, (50, 50), 0.125, np.zeros(2), False, np.zeros(3))
+    assert float(placed[2:-2, 2:-2].std()) < 1.2 * float(noise.std()) / 8

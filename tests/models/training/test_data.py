@@ -1,24 +1,27 @@
 """What needs no torch: reading data sets, holding photos out, random views."""
 
-import io
 import json
 import tarfile
 from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from library_store.skeleton import LSP14, R_HIP
+from models.errors import AnnotationError
 from models.training.augment import MIRROR, canonical, crop_matrix, random_view
 from models.training.dataset import (
     DEV_LABELLED,
     DEV_RENDERED,
     LabelledCrop,
+    decode_members,
     held_out,
     load,
     read_crops,
 )
 from models.training.scenes import mosaic
+from tests.models.training.data_files import write_tar
 
 
 def labelled_crop(group: int = 0) -> LabelledCrop:
@@ -49,24 +52,49 @@ def test_labels_are_read_and_hardly_labelled_crops_left_out(tmp_path: Path) -> N
     assert crops[0].weight[-1] == 0
 
 
+def _photo(path: Path, brightness: int = 0) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(path), np.full((32, 32, 3), brightness, np.uint8))
+    return path
+
+
+def test_photos_in_subfolders_and_of_any_suffix_are_read(tmp_path: Path) -> None:
+    _photo(tmp_path / "one" / "a.jpg")
+    _photo(tmp_path / "two" / "b.JPG")
+    _photo(tmp_path / "c.jpeg")
+    (tmp_path / "two" / "._b.JPG").write_bytes(b"of macOS")
+    (tmp_path / "notes.txt").write_text("no photo")
+    assert set(decode_members(tmp_path)) == {"a.jpg", "b.JPG", "c.jpeg"}
+    with tarfile.open(tmp_path / "all.tar", "w") as tar:
+        for folder in ("one", "two"):
+            tar.add(tmp_path / folder, folder)
+    assert set(decode_members(tmp_path / "all.tar")) == {"a.jpg", "b.JPG"}
+
+
+def test_photos_that_cannot_be_told_or_read_are_named(tmp_path: Path) -> None:
+    with pytest.raises(AnnotationError, match="has no JPEG"):
+        decode_members(tmp_path)
+    _photo(tmp_path / "one" / "a.jpg")
+    second = _photo(tmp_path / "two" / "a.jpg", 99)
+    with pytest.raises(AnnotationError, match=r"two files a\.jpg"):
+        decode_members(tmp_path)
+    second.rename(tmp_path / "b.jpg")
+    for data in (b"", b"oops"):
+        (tmp_path / "b.jpg").write_bytes(data)
+        with pytest.raises(AnnotationError, match=r"b\.jpg is no JPEG"):
+            decode_members(tmp_path)
+    record = {"image": "gone.jpg", "joints_px": [[1, 2]] * 14, "labelled": [1] * 14}
+    (tmp_path / "annotations.json").write_text(json.dumps({"images": [record]}))
+    with pytest.raises(AnnotationError, match=r"names gone\.jpg, which is not there"):
+        load(tmp_path)
+
+
 def _tar(path: Path, count: int, joints: list[list[float]], no_torso: int = -1) -> None:
     """Crops, one of them (``no_torso``) with a hip that nobody labelled."""
-    records = [
-        {
-            "image": f"{path.stem}{i}.jpg",
-            "joints_px": joints,
-            "labelled": [int(i != no_torso or joint != R_HIP) for joint in range(14)],
-        }
-        for i in range(count)
-    ]
-    _, jpeg = cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))
-    members = [("annotations.json", json.dumps({"images": records}).encode())]
-    members += [(str(r["image"]), jpeg.tobytes()) for r in records]
-    with tarfile.open(path, "w") as tar:
-        for name, data in members:
-            info = tarfile.TarInfo(name)
-            info.size = len(data)
-            tar.addfile(info, io.BytesIO(data))
+    labelled = np.ones((count, 14), int)
+    if no_torso >= 0:
+        labelled[no_torso, R_HIP] = 0
+    write_tar(path, np.zeros((count, 8, 8, 3), np.uint8), joints, labelled)
 
 
 def test_a_starred_file_is_drawn_more_often_and_what_is_kept_aside_is_not_trained_on(
@@ -93,6 +121,12 @@ def test_errors_are_not_measured_by_a_torso_that_nobody_labelled(tmp_path: Path)
     names = {c.name for c in kept["labelled_dev"]}
     assert len(names) == DEV_LABELLED - 1
     assert "lspet_x10.jpg" not in names | {c.name for c in crops}
+    # The same by its path, and of what is only measured on.
+    _tar(tmp_path / "mine.tar", 12, joints, no_torso=10)
+    crops, kept = read_crops(Path("/elsewhere"), str(tmp_path / "lspet_x"), str(tmp_path / "mine"))
+    assert {c.name for c in kept["labelled_dev"]} == names
+    assert len(crops) == 3
+    assert len(kept[str(tmp_path / "mine")]) == 11
 
 
 def test_a_photo_is_held_out_whole_and_always_the_same_ones() -> None:

@@ -139,6 +139,23 @@ def test_what_cannot_be_trained_on_is_refused(tmp_path: Path) -> None:
         )
 
 
+def test_the_network_it_starts_from_is_not_overwritten(start: Path, tmp_path: Path) -> None:
+    records = user_files.coco(tmp_path / "images", 24)
+    crops = read_coco(user_files.write(tmp_path / "l.json", records), tmp_path / "images")
+    before = (start / "start.onnx").read_bytes()
+    with pytest.raises(ModelError, match="would be overwritten: give another --name or --out"):
+        finetune(
+            crops,
+            weights_dir=start,
+            start="start",
+            out=start / "run" / "..",
+            name="start",
+            source="",
+            settings=FinetuneSettings(steps=1, threads=1),
+        )
+    assert (start / "start.onnx").read_bytes() == before
+
+
 def test_people_of_one_image_stay_on_one_side(tmp_path: Path) -> None:
     records = user_files.coco(tmp_path / "images", 40)
     crops = read_coco(user_files.write(tmp_path / "l.json", records), tmp_path / "images")

@@ -1,4 +1,4 @@
-"""8-bit twins give the same answers on every CPU; needs the train extra."""
+"""8-bit twins: the graph, and the same answers on every CPU; needs the train extra."""
 
 from pathlib import Path
 
@@ -9,12 +9,12 @@ import pytest
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
-from models.card import ModelCard, read_card  # noqa: E402
+from models.card import WEIGHTS_DIR, ModelCard, read_card  # noqa: E402
 from models.providers import runtime_of  # noqa: E402
 from models.training.export import person_card, publish  # noqa: E402
 from models.training.network import PersonConfig, PersonNetwork  # noqa: E402
 from models.training.onnx_graph import person_model  # noqa: E402
-from models.training.quantize import quantize  # noqa: E402
+from models.training.quantize import fold, quantize, same_boxes, take_blocks  # noqa: E402
 
 Photos = np.ndarray
 PAIR_MAX = 2**15 - 1
@@ -78,3 +78,28 @@ def test_a_twin_is_for_cpus_with_avx2(twin: tuple[Path, ModelCard]) -> None:
     assert str(runtime_of(card, "cpu", frozenset({"sse4_1", "avx", "avx2"}))) == "cpu/int8"
     assert str(runtime_of(card, "cpu", frozenset({"asimd", "asimddp"}))) == "cpu/int8"
     assert runtime_of(card, "cpu", frozenset({"sse4_1", "avx"})) is None
+
+
+@pytest.mark.parametrize(("name", "shape"), [("cpm", (160, 160)), ("person", (96, 64))])
+def test_the_stem_reads_blocks_as_it_read_pixels(
+    tmp_path: Path, name: str, shape: tuple[int, int]
+) -> None:
+    """Before any rounding the twin's graph computes what the network does."""
+    folded, blocks = tmp_path / "folded.onnx", tmp_path / "blocks.onnx"
+    fold(WEIGHTS_DIR / f"{name}.onnx", folded)
+    model = onnx.load(str(folded))
+    take_blocks(model)
+    onnx.save(model, str(blocks))
+    images = np.random.default_rng(0).integers(0, 256, (2, *shape, 3)).astype(np.uint8)
+    first, second = (
+        ort.InferenceSession(str(path), providers=["CPUExecutionProvider"]).run(
+            None, {"image": images}
+        )[0]
+        for path in (WEIGHTS_DIR / f"{name}.onnx", blocks)
+    )
+    np.testing.assert_allclose(second, first, atol=2e-3 * np.abs(first).max())
+
+
+def test_networks_that_find_nobody_agree() -> None:
+    photos = [np.zeros((96, 128, 3), np.uint8)]
+    assert same_boxes(WEIGHTS_DIR, ("person", "person"), photos) == 1.0

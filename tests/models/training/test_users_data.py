@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from library_store.skeleton import LSP14
 from models.errors import AnnotationError
 from models.training.users_coco import KEPT_PX, read_coco
 from models.training.users_h36m import read_human36m
+from tests.app.imaging.test_decode import tiff, with_exif
 from tests.models.training import user_files
 
 JOINT = {name: i for i, name in enumerate(LSP14.joint_names)}
@@ -72,6 +74,64 @@ def test_what_does_not_matter_is_passed_over(tmp_path: Path) -> None:
     assert [crop.name for crop in found] == [crop.name for crop in wanted]
 
 
+@pytest.mark.parametrize("nothing", [None, float("nan")])
+def test_what_tools_write_for_not_labelled(tmp_path: Path, nothing: float | None) -> None:
+    records = user_files.coco(tmp_path / "images")
+    path = user_files.write(tmp_path / "labels.json", records)
+    wanted = read_coco(path, tmp_path / "images")
+    for record in records["annotations"]:
+        flat = record["keypoints"]
+        unlabelled = [i for i in range(0, len(flat), 3) if flat[i + 2] == 0]
+        for i in unlabelled:
+            flat[i : i + 3] = [nothing, nothing, nothing if i % 2 else 0]
+        record["iscrowd"] = None
+    records["annotations"] += [
+        {"id": 90, "image_id": 0, "category_id": 1, "keypoints": None},
+        {"id": 91, "image_id": 0, "category_id": 1, "keypoints": [nothing] * 39},
+    ]
+    records["categories"].append({"id": 9, "name": "ball", "keypoints": None})
+    found = read_coco(user_files.write(path, records), tmp_path / "images")
+    assert [crop.name for crop in found] == [crop.name for crop in wanted]
+    for ours, theirs in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(ours.joints_px, theirs.joints_px)
+        np.testing.assert_array_equal(ours.weight, theirs.weight)
+
+
+def test_phone_photos_labelled_upright_are_read_upright(tmp_path: Path) -> None:
+    records = user_files.coco(tmp_path / "images", 1)
+    path = user_files.write(tmp_path / "labels.json", records)
+    wanted = read_coco(path, tmp_path / "images")
+    image = cv2.imread(str(tmp_path / "images" / "0.png"))
+    assert image is not None
+    lying = cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE)
+    _, jpeg = cv2.imencode(".jpg", lying, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    (tmp_path / "images" / "0.jpg").write_bytes(with_exif(jpeg.tobytes(), tiff(6)))
+    records["images"][0]["file_name"] = "0.jpg"
+    found = read_coco(user_files.write(path, records), tmp_path / "images")
+    for ours, theirs in zip(found, wanted, strict=True):
+        np.testing.assert_array_equal(ours.joints_px, theirs.joints_px)
+        assert np.abs(ours.image.astype(int) - theirs.image).mean() < 14, "as JPEG has it"
+    # A tool that shows photos as they are stored states their size so.
+    records["images"][0] |= {"width": 240, "height": 320}
+    for record in records["annotations"]:
+        triples = np.array(record["keypoints"]).reshape(-1, 3)
+        x, y, v = triples.T
+        record["keypoints"] = np.stack([y, np.where(v > 0, 319 - x, 0), v], 1).ravel().tolist()
+    found = read_coco(user_files.write(path, records), tmp_path / "images")
+    for ours, theirs in zip(found, wanted, strict=True):
+        turned = cv2.rotate(theirs.image, cv2.ROTATE_90_COUNTERCLOCKWISE)
+        assert np.abs(ours.image.astype(int) - turned).mean() < 14
+
+
+def test_a_file_under_two_ids_is_one_image(tmp_path: Path) -> None:
+    """As in merged sets: else one may be held out and the other trained on."""
+    records = user_files.coco(tmp_path / "images", 2)
+    records["images"].append(dict(records["images"][1], id=50))
+    records["annotations"].append(records["annotations"][0] | {"id": 99, "image_id": 50})
+    path = user_files.write(tmp_path / "labels.json", records)
+    assert [crop.group for crop in read_coco(path, tmp_path / "images")] == [0, 0, 1, 1, 1]
+
+
 def _set(index: int, value: float) -> Callable[[Records], None]:
     def change(records: Records) -> None:
         records["annotations"][0]["keypoints"][index] = value
@@ -88,7 +148,10 @@ def _normalised(records: Records) -> None:
 
 DAMAGE: dict[str, tuple[Callable[[Records], object], str]] = {
     "no categories": (lambda r: r.pop("categories"), "categories: Field required"),
-    "boxes only": (lambda r: r["categories"][0].pop("keypoints"), "no category has keypoints"),
+    "boxes only": (
+        lambda r: [record.pop("keypoints") for record in (*r["categories"], *r["annotations"])],
+        "no category has keypoints",
+    ),
     "other names": (
         lambda r: r["categories"][0].update(keypoints=[f"k{i}" for i in range(13)]),
         "lacks the keypoints l_ankle",
@@ -102,6 +165,16 @@ DAMAGE: dict[str, tuple[Callable[[Records], object], str]] = {
         "annotation 0 has 38 numbers",
     ),
     "text": (lambda r: r["annotations"][0].update(keypoints=["a"]), r"annotations\.0\.keypoints"),
+    "keypoints without names": (
+        lambda r: [r["annotations"][0]["keypoints"].extend([1, 1, 2]) for _ in range(4)],
+        "annotation 0 has 51 numbers.*category's 13 keypoints",
+    ),
+    "names forgotten": (
+        lambda r: r["categories"][0].update(keypoints=[]),
+        r"no category says in categories\[\*\]\.keypoints",
+    ),
+    "visible nowhere": (_set(3, float("nan")), "annotation 0.* its x or y is no number"),
+    "infinite": (_set(3, float("inf")), "annotation 0.* its x or y is no number"),
     "confidences": (_set(5, 0.7), "visibility that is not 0, 1 or 2"),
     "outside": (_set(3, 5000.0), r"annotation 0 has a keypoint at \(5000,.*320x240"),
     "normalised": (_normalised, "lie within 0..1"),
@@ -183,6 +256,21 @@ def test_frames_of_human36m_lie_under_their_poses(human36m: Path) -> None:
         assert crop.joints_px[JOINT["l_hip"], 0] > crop.joints_px[JOINT["r_hip"], 0]
 
 
+def test_the_cameras_of_a_take_are_one_group(human36m: Path, tmp_path: Path) -> None:
+    """They film the same poses at once: none may be held out while another is trained on."""
+    folder, videos = (human36m / "S1" / part for part in ("MyPoseFeatures/D2_Positions", "Videos"))
+    for name in ("Walking 1.60457274", "Walking.54138969"):
+        shutil.copy(tmp_path / "pose.npz", folder / f"{name}.npz")
+        shutil.copy(videos / "Walking 1.54138969.mp4", videos / f"{name}.mp4")
+    shutil.copytree(human36m / "S1", human36m / "S5")
+    groups: dict[str, set[int]] = {}
+    for crop in read_human36m(human36m, frames_apart=APART):
+        groups.setdefault(crop.name.partition("/")[0], set()).add(crop.group)
+    assert groups["Walking 1.54138969"] == groups["Walking 1.60457274"]
+    assert len(groups["Walking 1.54138969"]) == 2, "two subjects"
+    assert len(set.union(*groups.values())) == 4
+
+
 def test_npz_may_stand_for_cdf(human36m: Path, tmp_path: Path) -> None:
     folder = human36m / "S1" / "MyPoseFeatures" / "D2_Positions"
     cdf = read_human36m(human36m, frames_apart=APART)
@@ -194,8 +282,9 @@ def test_npz_may_stand_for_cdf(human36m: Path, tmp_path: Path) -> None:
 
 
 def test_human36m_that_is_not_whole_is_refused(human36m: Path) -> None:
-    with pytest.raises(AnnotationError, match="in a folder S9"):
-        read_human36m(human36m, ("S9",))
+    for subjects in (("S9",), ("S1", "S9")):
+        with pytest.raises(AnnotationError, match="in a folder S9"):
+            read_human36m(human36m, subjects)
     folder = human36m / "S1" / "MyPoseFeatures" / "D2_Positions"
     np.savez(folder / "Sitting.npz", Pose=np.zeros((5, 96)))
     video = human36m / "S1" / "Videos" / "Walking 1.54138969.mp4"
