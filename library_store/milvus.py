@@ -206,7 +206,11 @@ def open_milvus(manifest: Manifest, settings: MilvusSettings, describe: Describe
 
 
 def connect(settings: MilvusSettings) -> Any:
-    """A connected ``pymilvus.MilvusClient``; ``LibraryError`` without the extra ``milvus``."""
+    """A connected ``pymilvus.MilvusClient``; ``LibraryError`` without the extra ``milvus``.
+
+    Clients of one server share a connection, which closing one of them leaves to the others (of
+    pymilvus 2.6 it did not: a reload that was refused took it from the library in service).
+    """
     try:
         from pymilvus import MilvusClient
     except ImportError:

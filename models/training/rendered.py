@@ -23,12 +23,14 @@ import cv2
 import numpy as np
 
 from library_store.skeleton import LSP14
+from models.errors import AnnotationError
 from models.training.dataset import decode_members
 from models.training.rendering.backdrop import Backgrounds
 from models.training.rendering.body import BodyModel
 from models.training.rendering.pose import Poser, TrunkStats
 from models.training.rendering.poses import PoseSource
 from models.training.rendering.scene import Studio
+from models.training.scenes import read_people
 
 JPEG_QUALITY = (60, 95)
 CAST = 250
@@ -76,7 +78,16 @@ def open_studio(
     ``body`` the folder mpfb2, ``mocap`` an npz with ``positions`` (N, 14, 3) mm y up,
     ``backgrounds`` a tar of JPEGs, ``people`` their boxes as ``models.training.label_scenes``
     writes them, ``unseen`` a ground_truth.json whose poses are kept out, ``cast`` how many bodies.
+    Raises ``AnnotationError`` where ``people`` is of other photos.
     """
+    photos = decode_members(backgrounds)
+    avoid = [np.zeros((0, 4), np.float32)] * len(photos)
+    if people is not None:
+        boxes = read_people(people)
+        missing = sorted(photos.keys() - boxes.keys())
+        if missing:
+            raise AnnotationError(f"{people} does not say who is in {missing[0]} of {backgrounds}")
+        avoid = [boxes[name][:, :4] for name in photos]
     poses = np.load(mocap)["positions"][::2].astype(np.float32)  # neighbours hardly differ
     tests = None
     if unseen is not None:
@@ -86,9 +97,6 @@ def open_studio(
     model = BodyModel(body)
     source = PoseSource(poses, tests)
     poser = Poser(model, TrunkStats.of(poses[::97]))
-    photos = decode_members(backgrounds)
-    boxes = {r["image"]: r["people"] for r in json.loads(people.read_text())} if people else {}
-    avoid = [np.array(boxes.get(n, []), np.float32).reshape(-1, 5)[:, :4] for n in photos]
     return Studio(model, poser, source, Backgrounds(list(photos.values()), avoid), cast)
 
 

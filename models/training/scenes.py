@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from models.errors import AnnotationError
 from models.training.augment import expose
 from models.training.cutout import place
 from models.training.dataset import Image, LabelledCrop, decode_members
@@ -27,13 +28,25 @@ class LabelledScene:
     people: NDArray[np.float32]
 
 
+def read_people(labels: Path) -> dict[str, NDArray[np.float32]]:
+    """What ``label_scenes`` wrote: by image the boxes and scores (n, 5), in its order."""
+    return {
+        record["image"]: np.array(record["people"], np.float32).reshape(-1, 5)
+        for record in json.loads(labels.read_text())
+    }
+
+
 def read_scenes(images: Path, labels: Path) -> tuple[list[LabelledScene], list[LabelledScene]]:
-    """The scenes to train on and the held-out ones, as ``label_scenes`` labelled them."""
+    """The scenes to train on and the held-out ones, as ``label_scenes`` labelled them.
+
+    Raises ``AnnotationError`` where labels are of other scenes.
+    """
     pictures = decode_members(images)
-    scenes = [
-        LabelledScene(pictures[r["image"]], np.array(r["people"], np.float32).reshape(-1, 5))
-        for r in json.loads(labels.read_text())
-    ]
+    people = read_people(labels)
+    missing = sorted(people.keys() - pictures.keys())
+    if missing:
+        raise AnnotationError(f"{labels} labels {missing[0]}, which is not in {images}")
+    scenes = [LabelledScene(pictures[name], boxes) for name, boxes in people.items()]
     return [s for i, s in enumerate(scenes) if i % DEV_ONE_IN], scenes[::DEV_ONE_IN]
 
 

@@ -182,6 +182,16 @@ def test_what_milvus_finds_is_what_is_nearest(remote: Library, exact: Library) -
 
 
 @pytest.mark.slow
+def test_a_library_that_is_closed_leaves_the_others_their_connection(
+    remote: Library, exact: Library, replica: Path, settings: MilvusSettings
+) -> None:
+    """As when a reload is refused while the old library is in service."""
+    load(replica, backend="milvus", milvus=settings).close()
+    points = noisy_queries(exact.descriptors(np.arange(100)), 1)
+    assert remote.match(points, None, 5).entries.shape == (1, 5)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("mask", MASKS)
 def test_masked(mask: str, remote: Library, exact: Library) -> None:
     queries = noisy_queries(exact.descriptors(np.arange(4_000)), 10)

@@ -20,7 +20,8 @@ from models.training.dataset import (
     load,
     read_crops,
 )
-from models.training.scenes import mosaic
+from models.training.rendered import open_studio
+from models.training.scenes import mosaic, read_scenes
 from tests.models.training.data_files import write_tar
 
 
@@ -87,6 +88,27 @@ def test_photos_that_cannot_be_told_or_read_are_named(tmp_path: Path) -> None:
     (tmp_path / "annotations.json").write_text(json.dumps({"images": [record]}))
     with pytest.raises(AnnotationError, match=r"names gone\.jpg, which is not there"):
         load(tmp_path)
+
+
+def test_boxes_of_other_photos_are_refused(tmp_path: Path) -> None:
+    photos = tmp_path / "photos"
+    for name in ("a.jpg", "b.jpg"):
+        _photo(photos / name)
+    labels = tmp_path / "scenes.json"
+    people = {"a.jpg": [[1, 2, 3, 4, 0.9]], "b.jpg": [], "c.jpg": []}
+
+    def label(*names: str) -> None:
+        labels.write_text(json.dumps([{"image": n, "people": people[n]} for n in names]))
+
+    label("a.jpg", "b.jpg")
+    train, dev = read_scenes(photos, labels)
+    assert [len(scene.people) for scene in (*dev, *train)] == [1, 0]
+    label("a.jpg", "c.jpg")
+    with pytest.raises(AnnotationError, match=r"labels c\.jpg, which is not in"):
+        read_scenes(photos, labels)
+    label("a.jpg")
+    with pytest.raises(AnnotationError, match=r"does not say who is in b\.jpg"):
+        open_studio(tmp_path, tmp_path, photos, people=labels)
 
 
 def _tar(path: Path, count: int, joints: list[list[float]], no_torso: int = -1) -> None:
