@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import onnxruntime as ort
 import pytest
 
 from app import engine
@@ -18,6 +17,7 @@ from library_store.build import BuildSettings, build_library
 from library_store.library import Library, load
 from library_store.prior import PosePrior
 from models.card import WEIGHTS_DIR
+from tests.cuda import claim_cuda
 
 
 def test_networks_are_chosen_anew_where_cuda_does_not_start(
@@ -29,17 +29,7 @@ def test_networks_are_chosen_anew_where_cuda_does_not_start(
     card = json.loads((tmp_path / "cpm.json").read_text())
     dear = card | {"name": "dear", "accuracy": 0.9, "cost_ms": {"cpu/fp32": 1e4}}
     (tmp_path / "dear.json").write_text(json.dumps(dear))
-    real: Any = ort.InferenceSession
-
-    def falls_back(data: bytes, options: ort.SessionOptions, providers: list[Any]) -> Any:
-        del providers
-        options.add_session_config_entry("session.disable_cpu_ep_fallback", "0")
-        return real(data, options, providers=["CPUExecutionProvider"])
-
-    monkeypatch.setattr(ort, "InferenceSession", falls_back)
-    monkeypatch.setattr(
-        ort, "get_available_providers", lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"]
-    )
+    claim_cuda(monkeypatch)
     settings = Settings(weights_dir=tmp_path)
     assert engine.chosen_networks(settings) == ("dear", "person"), "on CUDA it would cost nothing"
     estimator, detector = load_networks(settings)

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime as ort
 import pytest
 
 from models import ModelError, PersonDetector, PoseEstimator
 from models.card import WEIGHTS_DIR, read_card
 from models.choice import choose
 from models.session import OnnxModel
+from tests.cuda import claim_cuda
 from tests.models import tiny_onnx
 from tests.models.tiny_onnx import FLOAT16, node, planes
 
@@ -184,17 +184,7 @@ def test_a_provider_that_fails_is_refused_when_asked_for_and_replaced_by_auto(
     """onnxruntime claims CUDA as its GPU build does where there is no driver: the session falls
     back to the CPU without an error."""
     tiny_onnx.write(tmp_path, "tiny", SOUND)
-    real: Any = ort.InferenceSession
-
-    def falls_back(data: bytes, options: ort.SessionOptions, providers: list[Any]) -> Any:
-        del providers
-        options.add_session_config_entry("session.disable_cpu_ep_fallback", "0")
-        return real(data, options, providers=["CPUExecutionProvider"])
-
-    monkeypatch.setattr(ort, "InferenceSession", falls_back)
-    monkeypatch.setattr(
-        ort, "get_available_providers", lambda: ["CUDAExecutionProvider", "CPUExecutionProvider"]
-    )
+    claim_cuda(monkeypatch)
     with pytest.raises(ModelError, match="POSEMATCH_PROVIDER=cuda: cuda cannot run model tiny"):
         OnnxModel(tmp_path, "tiny", provider="cuda")
     with caplog.at_level(logging.WARNING):
