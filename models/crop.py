@@ -35,12 +35,8 @@ def square_crop(
         top = max(0, int(origin[1] - scale))
         right = min(width, int(origin[0] + side_px + scale) + 1)
         bottom = min(height, int(origin[1] + side_px + scale) + 1)
-        columns, rows = (right - left) // shrink, (bottom - top) // shrink
-        if columns >= 1 and rows >= 1:
-            window = image[top : top + rows * shrink, left : left + columns * shrink]
-            source = np.asarray(
-                cv2.resize(window, (columns, rows), interpolation=cv2.INTER_AREA), np.uint8
-            )
+        if right - left >= shrink and bottom - top >= shrink:
+            source = _block_means(image[top:bottom, left:right], shrink)
         else:
             shrink, left, top = 1, 0, 0
     # Block b averages photo pixels whose centre is left + (b + 0.5) * shrink - 0.5.
@@ -78,11 +74,16 @@ def warped(
     linear, shift = matrix[:, :2].astype(np.float64), matrix[:, 2].astype(np.float64)
     shrink = min(int(1 / max(float(np.sqrt(abs(np.linalg.det(linear)))), 1e-6)), height, width)
     if shrink >= 2:
-        rows, columns = height // shrink, width // shrink
-        window = image[: rows * shrink, : columns * shrink]
-        image = cv2.resize(window, (columns, rows), interpolation=cv2.INTER_AREA)
+        image = _block_means(image, shrink)
         # Block b averages pixels whose centre is (b + 0.5) * shrink - 0.5.
         shift = shift + linear.sum(1) * (shrink - 1) / 2
         linear = linear * shrink
     placed = np.concatenate([linear, shift[:, None]], axis=1)
     return cv2.warpAffine(image, placed, size, borderMode=border, borderValue=value)
+
+
+def _block_means(image: NDArray[Any], side: int) -> NDArray[Any]:
+    """Means of whole blocks of ``side`` by ``side`` pixels; what is left at the end is left out."""
+    rows, columns = image.shape[0] // side, image.shape[1] // side
+    window = image[: rows * side, : columns * side]
+    return cv2.resize(window, (columns, rows), interpolation=cv2.INTER_AREA)
