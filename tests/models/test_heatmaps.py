@@ -7,6 +7,7 @@ from models.heatmaps import (
     calibrated,
     marginals,
     peak_beliefs,
+    pooled,
     read_maps,
     spread,
     sub_cell_peaks,
@@ -40,6 +41,44 @@ def test_peak_of_a_gaussian_is_found_to_a_tenth_of_an_input_pixel(
     maps = gaussian(x, y, sigma, sigma * ratio, rho)[None, None].astype(np.float32)
     at, _ = sub_cell_peaks(marginals(maps, "logits"))
     assert np.abs(at[0, 0] - (x, y)).max() * STRIDE < 0.1
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    u=st.floats(0, 1),
+    v=st.floats(0, 1),
+    sigma=st.floats(1.0, 3.0),  # a narrower one is more than its samples tell
+    ratio=st.floats(0.8, 1.6),
+    rho=st.floats(-0.5, 0.5),
+)
+@example(u=0.0, v=1.0, sigma=3.0, ratio=1.6, rho=0.5)
+def test_pooling_leaves_a_gaussian_where_it_is(
+    u: float, v: float, sigma: float, ratio: float, rho: float
+) -> None:
+    # Away from the border, by as much as the wider it is.
+    margin = 4 + 1.5 * sigma * max(1.0, ratio)
+    x, y = margin + np.array([u, v]) * (CELLS - 1 - 2 * margin)
+    maps = gaussian(x, y, sigma, sigma * ratio, rho)[None, None].astype(np.float32)
+    at, _ = sub_cell_peaks(pooled(marginals(maps, "logits")))
+    assert np.abs(at[0, 0] - (x, y)).max() * STRIDE < 0.1
+
+
+@pytest.mark.parametrize("x", [0.0, 1.0, 2.0, 3.0])
+def test_pooled_peaks_at_the_border_move_inwards_by_less_than_a_cell(x: float) -> None:
+    maps = gaussian(x, CELLS - 1 - x, 1.5, 1.5)[None, None].astype(np.float32)
+    at, _ = sub_cell_peaks(pooled(marginals(maps, "logits")))
+    off = (at[0, 0] - (x, CELLS - 1 - x)) * (1, -1)
+    assert (off > -0.01).all()
+    assert (off < 0.8).all()
+
+
+def test_a_hill_is_believed_before_a_sharper_peak_of_less_belief() -> None:
+    hill = 0.7 * np.exp(gaussian(10, 20, 2.0, 2.0)) / 2.0**2
+    peak = 0.3 * np.exp(gaussian(30, 20, 0.8, 0.8)) / 0.8**2
+    assert peak.max() > hill.max()
+    maps = np.stack([hill + peak, np.zeros_like(hill)])[None].astype(np.float32)
+    read = read_maps(maps, 1, "beliefs", target_sigma_cells=1.0)
+    np.testing.assert_allclose(read.at[0, 0], (10, 20), atol=0.1)
 
 
 def test_beliefs_and_logits_give_the_same_place() -> None:
