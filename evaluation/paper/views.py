@@ -6,7 +6,7 @@ joints in the camera frame (OpenCV axes, mm) and in pixels. The world has Y up.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,7 @@ VIRTUAL_DISTANCE_MM = 4500.0
 VIRTUAL_ELEVATION_DEG = 8.0
 N_VIRTUAL = 4
 """Human3.6M has four cameras about as far away, at about that height and focal length."""
+FIRST_VIRTUAL = "virtual-0"
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,9 @@ class Views:
         return self.scenes[int(self.scene[row])].cameras[int(self.camera[row])]
 
     def by_camera(self) -> list[tuple[SceneCamera, Integers]]:
-        """The rows that each camera sees."""
+        """The rows that each camera sees; a camera that sees nobody is left out."""
+        if not len(self):
+            return []
         pairs = np.stack([self.scene, self.camera], axis=1)
         unique, which = np.unique(pairs, axis=0, return_inverse=True)
         order = np.argsort(which.reshape(-1), kind="stable")
@@ -116,9 +119,9 @@ def look(
     *,
     seconds_apart: float | None = None,
     first_seconds: float = np.inf,
-    cameras: int | None = None,
+    cameras: Collection[str] | None = None,
 ) -> Views:
-    """Every frame, or one every ``seconds_apart``, by all cameras of each scene or the first ones.
+    """Every frame, or one every ``seconds_apart``, by all cameras of each scene or those named.
 
     Frames of which the person, or a part, is not in front of the camera are left out.
     """
@@ -128,7 +131,11 @@ def look(
         rate = clip.frame_rate_hz if np.isfinite(clip.frame_rate_hz) else 50.0
         step = 1 if seconds_apart is None else max(1, round(rate * seconds_apart))
         n = int(min(len(clip), np.ceil(first_seconds * rate)))
-        parts += [(number, k, np.arange(0, n, step)) for k in range(len(scene.cameras))[:cameras]]
+        parts += [
+            (number, k, np.arange(0, n, step))
+            for k, camera in enumerate(scene.cameras)
+            if cameras is None or camera.name in cameras
+        ]
     return _gather(tuple(scenes), parts)
 
 

@@ -19,7 +19,7 @@ from evaluation.paper.videos import find_videos, look_at_videos
 from evaluation.paper.views import draw, look
 from library_store.cameras import rotations
 from library_store.importers import Clip, write_npz
-from library_store.importers.h36m import H36M_32
+from library_store.importers.h36m import CAMERAS, H36M_32
 from library_store.importers.rotation import up_to_y
 from models.card import WEIGHTS_DIR
 from tests.evaluation.paper.made_data import (
@@ -76,6 +76,28 @@ def test_without_cameras_and_videos_the_rest_is_done(tmp_path: Path) -> None:
     missing = text.split("## Missing")[1]
     for what in ("metadata.xml", "tables 1, 3, 4 and 6", "HumanEva-I: no"):
         assert what in missing
+
+
+def test_table_5_is_of_the_first_camera_where_each_has_its_own_files(tmp_path: Path) -> None:
+    data, out = tmp_path / "data", tmp_path / "out"
+    data.mkdir()
+    metadata_xml(data / "metadata.xml")
+    for number, subject in enumerate(("S1", "S9", "S11")):
+        for index in (0, 1):
+            rotation, place = made_camera(index)
+            mono = (acting(60, number) - place) @ rotation.T
+            folder = data / subject / "MyPoseFeatures" / "D3_Positions_mono"
+            write_cdf(folder / f"Walking 1.{CAMERAS[index]}.cdf", mono)
+    arguments = ["--data", str(data), "--out", str(out), "--entries", "0", "--curve-views", "4"]
+    main([*arguments, "--views", "0"])
+    # 12 frames of 60 by two cameras of two subjects; table 5 has one camera of them.
+    assert "2, 48, 24 (diagnostic)" in (out / "report.md").read_text()
+    for path in data.rglob(f"*.{CAMERAS[0]}.cdf"):
+        path.unlink()
+    main([*arguments, "--views", "4"])
+    text = (out / "report.md").read_text()
+    assert "Table 5:" not in text
+    assert f"table 5: needs camera {CAMERAS[0]}" in text
 
 
 def test_an_empty_folder_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
