@@ -22,6 +22,9 @@ LIMB_ENDS = tuple(
 )
 """The joints that are spoilt in the missing and corrupted rows."""
 
+UNREADABLE_NPZ = (KeyError, ValueError, TypeError, AttributeError, EOFError, BadZipFile)
+"""What numpy raises for a file that is no npz, or not of the arrays that are wanted."""
+
 
 @dataclass(frozen=True)
 class LiftingSet:
@@ -68,18 +71,38 @@ def load_lifting_set(path: Path) -> LiftingSet:
             }
             truth = data["joints_3d_mm"].astype(np.float64)
             focal_px = float(data["focal_length_px"])
-    except (KeyError, ValueError, TypeError, AttributeError, EOFError, BadZipFile) as error:
+    except UNREADABLE_NPZ as error:
         raise PoseMatchError(f"{path} is no set of people to lift: {error}") from error
-    if not points or any(it.shape != (*truth.shape[:2], 2) for it in points.values()):
-        raise PoseMatchError(
-            f"{path} is no set of people to lift: wanted is {prefix}0 and the like"
-        )
+    problem = _problem(truth, points, focal_px)
+    if problem:
+        raise PoseMatchError(f"{path} is no set of people to lift: {problem}")
     return LiftingSet(
         path.stem,
         truth,
         dict(sorted(points.items())),
         Intrinsics(focal_px, (0.0, 0.0), "request"),
     )
+
+
+def _problem(truth: Floats, points: dict[int, Floats], focal_px: float) -> str:
+    """What keeps people with this truth and these points from being lifted, or nothing."""
+    n, joints = len(truth), LSP14.n_joints
+    if truth.shape != (n, joints, 3) or n == 0:
+        return f"joints_3d_mm is {truth.shape}; wanted is (N, {joints}, 3)"
+    if not points:
+        return "no 2D joints; wanted is joints_2d_px_noise0 and the like"
+    for noise, seen in points.items():
+        if seen.shape != (n, joints, 2):
+            return f"joints_2d_px_noise{noise} is {seen.shape}; wanted is {(n, joints, 2)}"
+    # An error that is nan would make nan of every mean.
+    bad = ~np.isfinite(truth).all((1, 2))
+    for seen in points.values():
+        bad |= ~np.isfinite(seen).all((1, 2))
+    if bad.any():
+        return f"{bad.sum()} of {n} people, the first number {bad.argmax()}, have joints of nan"
+    if not (np.isfinite(focal_px) and focal_px > 0):
+        return f"focal_length_px is {focal_px:g}"
+    return ""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from evaluation.paper.network import Network
 from evaluation.paper.runs import Options, run_cmu, run_users_data
+from evaluation.protocols import load_lifting_set
+from library_store.library import load
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -44,6 +47,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         path: Path | None = getattr(chosen, name)
         if path is not None and not path.exists():
             parser.error(f"--{name.replace('_', '-')} {path} does not exist")
+    # A file that is no good is named now, not after the hours that the tables before it take.
+    if chosen.library is not None:
+        load(chosen.library).close()
+    if chosen.mlp is not None:
+        Network.load(chosen.mlp)
+    if chosen.cross_set is not None:
+        load_lifting_set(chosen.cross_set)
     options = Options(
         out=chosen.out,
         entries=chosen.entries or None,
@@ -56,12 +66,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if chosen.data == "cmu":
         if chosen.mocap is None:
             parser.error("--data cmu needs --mocap")
-        run_cmu(chosen.mocap, chosen.cross_set, chosen.noise_px, options)
-        return
-    if not Path(chosen.data).is_dir():
-        parser.error(f"--data {chosen.data} is no folder")
-    if not run_users_data(Path(chosen.data), options):
-        sys.exit(f"posematch evaluate paper: no table can be made of what is in {chosen.data}")
+        place = chosen.mocap
+        done = run_cmu(place, chosen.cross_set, chosen.noise_px, options)
+    else:
+        place = Path(chosen.data)
+        if not place.is_dir():
+            parser.error(f"--data {place} is no folder")
+        done = run_users_data(place, options)
+    if not done:
+        sys.exit(f"posematch evaluate paper: no table can be made of what is in {place}")
 
 
 if __name__ == "__main__":

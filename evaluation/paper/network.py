@@ -15,9 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
+from app.errors import PoseMatchError
 from app.lifting.geometry import Floats, Mask
 from app.lifting.resection import resect
 from app.lifting.warp import warp_perspective
+from evaluation.protocols import UNREADABLE_NPZ
 from library_store.descriptor import normalise
 from library_store.skeleton import L_HIP, LSP14, R_HIP
 
@@ -63,12 +65,18 @@ class Network:
 
     @staticmethod
     def load(path: Path) -> Network:
-        """Read what ``evaluation.paper.mlp`` wrote."""
-        with np.load(path, allow_pickle=False) as data:
-            weights = {k: data[k].astype(np.float64) for k in data.files if k[:2] in ("w_", "b_")}
-            return Network(
-                weights, int(data["n_blocks"]), int(data["n_samples"]), str(data["poses"])
-            )
+        """Read what ``evaluation.paper.mlp`` wrote; ``PoseMatchError`` for any other file."""
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+                names = [k for k in data.files if k[:2] in ("w_", "b_")]
+                weights = {k: data[k].astype(np.float64) for k in names}
+                return Network(
+                    weights, int(data["n_blocks"]), int(data["n_samples"]), str(data["poses"])
+                )
+        except UNREADABLE_NPZ as error:
+            raise PoseMatchError(
+                f"{path} is no network of evaluation.paper.mlp: {error}"
+            ) from error
 
     @property
     def width(self) -> int:

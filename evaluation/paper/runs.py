@@ -160,14 +160,21 @@ def run_users_data(root: Path, options: Options) -> bool:
     return library is not None
 
 
-def run_cmu(mocap: Path, cross_set: Path | None, noise_px: float, options: Options) -> None:
-    """The analogues on free mocap: split by subject; Gaussian noise stands for a network."""
+def run_cmu(mocap: Path, cross_set: Path | None, noise_px: float, options: Options) -> bool:
+    """The analogues on free mocap: split by subject; Gaussian noise stands for a network.
+
+    Whether there is any table.
+    """
     told = Report(options.out)
     found, held_out = find_cmu(mocap)
     told.missing += found.missing
     train = [scene for scene in found.scenes if scene.clip.subject not in held_out]
     test = found.of(held_out)
     told.say("# The paper's tables on CMU's mocap", _what_is_drawn(options))
+    if not train or not test:
+        told.missing.append("tables: subjects to learn from and to test on are not all there")
+        told.close()
+        return False
     library = _frames_library("cmu-frames", train, options)
     p1 = _test_set(look(test, seconds_apart=P1_SECONDS), found, options)
     p2 = _test_set(look(test, seconds_apart=P2_SECONDS), found, options)
@@ -195,6 +202,7 @@ def run_cmu(mocap: Path, cross_set: Path | None, noise_px: float, options: Optio
         other = _lifting_views(cross_set, options)
         _table9(told, other, library, options, cross_set.stem, by_action=False)
     told.close()
+    return True
 
 
 def _all_tables(told: Report, data: Protocols, options: Options) -> None:

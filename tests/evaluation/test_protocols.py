@@ -25,6 +25,24 @@ def test_a_set_is_read_with_its_levels_of_noise(tmp_path: Path) -> None:
     assert len(people.half(1).joints_3d_mm) == 2
 
 
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"joints_3d_mm": np.ones((5, 17, 3))}, r"\(5, 17, 3\); wanted is \(N, 14, 3\)"),
+        ({"joints_2d_px_noise10": np.ones((4, 14, 2))}, r"noise10 is \(4, 14, 2\)"),
+        ({"joints_2d_px_noise0": np.full((5, 14, 2), np.nan)}, "5 of 5 people, the first number 0"),
+        ({"focal_length_px": 0.0}, "focal_length_px is 0"),
+    ],
+)
+def test_what_no_error_can_be_measured_of_is_named(
+    tmp_path: Path, changed: dict[str, Any], said: str
+) -> None:
+    path = tmp_path / "people.npz"
+    np.savez(path, **(WHOLE | changed))
+    with pytest.raises(PoseMatchError, match=said):
+        load_lifting_set(path)
+
+
 @pytest.mark.parametrize("missing", [*WHOLE, "zip"])
 def test_other_files_are_named(tmp_path: Path, missing: str) -> None:
     path = tmp_path / "people.npz"

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.errors import PoseMatchError
 from evaluation.metrics import rigid_error_mm, root_centred_error_mm
 from evaluation.paper.__main__ import main
 from evaluation.paper.datasets import find_cmu, find_h36m, find_humaneva, h36m_column
@@ -18,6 +19,7 @@ from evaluation.paper.systems import Seen2D, known_depths, optimal_exemplars, pa
 from evaluation.paper.videos import find_videos, look_at_videos
 from evaluation.paper.views import draw, look
 from library_store.cameras import rotations
+from library_store.errors import LibraryError
 from library_store.importers import Clip, write_npz
 from library_store.importers.h36m import CAMERAS, H36M_32
 from library_store.importers.rotation import up_to_y
@@ -116,6 +118,29 @@ def test_a_file_that_is_not_there_is_named_at_once(
     with pytest.raises(SystemExit):
         main(["--data", "cmu", "--mocap", str(mocap), option, str(tmp_path / "none")])
     assert f"{option} {tmp_path / 'none'} does not exist" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--library", "--mlp", "--cross-set"])
+def test_a_file_that_is_no_good_is_named_at_once(tmp_path: Path, option: str) -> None:
+    bad, out = tmp_path / "bad", tmp_path / "out"
+    bad.write_text("not what is wanted")
+    with pytest.raises((PoseMatchError, LibraryError), match="bad"):
+        main(["--data", str(tmp_path), "--out", str(out), option, str(bad)])
+    assert not out.exists()
+
+
+def test_mocap_without_people_to_test_says_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    joints = acting(90, 1)[:, H36M_32] @ up_to_y("+Z").T
+    mocap = tmp_path / "cmu.npz"
+    write_npz(
+        mocap,
+        [Clip("cmu_01", "cmu_01", "walk", 30.0, joints.astype(np.float32), np.arange(90))],
+    )
+    with pytest.raises(SystemExit, match=r"no table can be made of what is in .*cmu\.npz"):
+        main(["--data", "cmu", "--mocap", str(mocap), "--out", str(tmp_path / "out"), *SMALL])
+    assert "CMU subject cmu_35" in capsys.readouterr().out
 
 
 def test_videos_are_seen_by_the_network_of_the_settings(
