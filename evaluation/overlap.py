@@ -18,11 +18,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
 from evaluation.metrics import Floats
 from evaluation.pose2d import Estimate, networks
+from evaluation.progress import followed
 from library_store.skeleton import LIMB_JOINTS, LSP14
 from models.pck import correct_keypoints, torso_px
 from models.training.cutout import over, place, silhouette, whole
@@ -88,7 +87,7 @@ class Score:
 def score(estimate: Estimate, pairs: list[Pair], label: str) -> Score:
     """Run a network over both people of each pair."""
     found, truth, other, seen = [], [], [], []
-    for two in track(pairs, label, transient=True, console=Console(stderr=True)):
+    for two in followed(pairs, label):
         for i, person in enumerate(two.people):
             found.append(estimate(person))
             truth.append(person.joints_px)

@@ -19,11 +19,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import track
 
 from app.engine import chosen_networks
 from app.settings import load_settings
+from evaluation.progress import followed
 from models import PersonBox, PersonDetector, PoseEstimator
 from models.person_detector import Floats, corners, iou
 from models.presence import present
@@ -75,7 +74,7 @@ class Counts:
 def count(find: Find, scenes: list[Scene], label: str) -> Counts:
     """Run ``find`` over scenes. A duplicate is a further box of somebody found already."""
     found = wanted = total = strange = duplicates = 0
-    for scene in track(scenes, label, transient=True, console=Console(stderr=True)):
+    for scene in followed(scenes, label):
         boxes = corners(find(scene.image))
         overlap = iou(boxes, scene.wanted)
         found += int((overlap.max(0, initial=0) > SAME).sum())

@@ -18,8 +18,6 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from app.engine import chosen_networks
 from app.lifting.calibration import FUSION_SIGMA, SigmaCalibration
@@ -29,6 +27,7 @@ from app.settings import load_settings
 from evaluation.calibration import COVERAGE, Served
 from evaluation.metrics import Floats, root_centred_error_mm
 from evaluation.networks import add_network_option
+from evaluation.progress import followed
 from library_store.skeleton import LSP14
 from models.person_detector import PersonBox
 from models.pose_estimator import PoseEstimator
@@ -79,7 +78,7 @@ class Answers:
 def find_joints(renders: Path, estimator: PoseEstimator) -> Iterator[Seen]:
     """Every person of a rendered set, found by the true box."""
     images = decode_members(renders)
-    for record in track(read_annotations(renders), "joints", console=Console(stderr=True)):
+    for record in followed(read_annotations(renders), "joints"):
         if "joints_mm" not in record:
             raise SystemExit(f"{renders} has no 3D truth: render it anew")
         joints_px = np.array(record["joints_px"])

@@ -23,10 +23,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from evaluation.metrics import Floats
+from evaluation.progress import followed
 from library_store.skeleton import LIMB_JOINTS, LSP14
 from models import PersonBox, PoseEstimator
 from models.crop import square_crop
@@ -141,7 +140,7 @@ def find(estimate: Estimate, crops: list[LabelledCrop], label: str) -> Found:
     """Run a network over a set."""
     predicted = []
     spent = 0.0
-    for crop in track(crops, label, transient=True, console=Console(stderr=True)):
+    for crop in followed(crops, label):
         began = time.process_time()
         predicted.append(estimate(crop))
         spent += time.process_time() - began

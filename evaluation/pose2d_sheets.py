@@ -13,11 +13,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
 from evaluation.metrics import Floats
 from evaluation.pose2d import SCALE, networks
+from evaluation.progress import followed
 from library_store.sheet import draw_bone
 from library_store.skeleton import LSP14
 from models.training.augment import crop_matrix
@@ -60,7 +59,7 @@ def main() -> None:
     compared = networks(args.name, args.weights, args.reference)
     args.out.mkdir(parents=True, exist_ok=True)
     starts = range(0, len(order), PEOPLE_A_SHEET)
-    for start in track(starts, "sheets", transient=True, console=Console(stderr=True)):
+    for start in followed(starts, "sheets"):
         people = [crops[i] for i in order[start : start + PEOPLE_A_SHEET]]
         rows = [np.hstack([drawn(c, run(c)) for c in people]) for run in compared.values()]
         cv2.imwrite(str(args.out / f"sheet_{start // PEOPLE_A_SHEET:02d}.png"), np.vstack(rows))

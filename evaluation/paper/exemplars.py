@@ -6,7 +6,7 @@ written twice.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -140,11 +140,18 @@ def fraction(library: Library, n: int, seed: int) -> Exemplars:
     )
 
 
-def write_library(directory: Path, exemplars: Exemplars) -> Library:
-    """Write a library at ``directory`` (replacing what is there) and open it."""
+def write_library(
+    directory: Path,
+    exemplars: Exemplars,
+    report: Callable[[str, float], None] = lambda _stage, _fraction: None,
+) -> Library:
+    """Write a library at ``directory`` (replacing what is there) and open it.
+
+    ``report`` hears the fraction done of each stage.
+    """
     with locked(directory, waiting=lambda: None), replacing(directory, "paper") as workshop:
         steps = Steps(workshop)
-        posed = write_poses(steps, workshop, [exemplars], exemplars.clips, _quiet)
+        posed = write_poses(steps, workshop, [exemplars], exemplars.clips, report)
         seen = steps.run(
             "descriptors",
             lambda: _write_descriptors(workshop, exemplars.cameras_of),
@@ -153,12 +160,12 @@ def write_library(directory: Path, exemplars: Exemplars) -> Library:
         write_manifest(
             steps,
             workshop,
-            _quiet,
+            report,
             name=_url_safe(directory.name),
             version="1",
             licences=[Licence(source="training frames", licence=exemplars.licence, credit="")],
             build={"by": "evaluation.paper", "camera_columns": list(COLUMNS)},
-            index=write_index(steps, workshop, IndexSettings(), _quiet),
+            index=write_index(steps, workshop, IndexSettings(), report),
             counts={**posed, **seen},
         )
     return load(directory, verify=False)
@@ -174,10 +181,6 @@ def _write_descriptors(workshop: Path, cameras: NDArray[np.float32]) -> Facts:
         for rows in slices(n):
             table.append(describe(project(cameras[rows], poses[rows])))
     return {"n_cameras": n}
-
-
-def _quiet(_stage: str, _fraction: float) -> None:
-    """Small libraries take no time worth a bar."""
 
 
 def _url_safe(name: str) -> str:

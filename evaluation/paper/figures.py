@@ -39,13 +39,13 @@ class Shown:
 
 
 def failure(test: TestSet, source: str, library: Library) -> Picture:
-    """Figure 2: the 19th worst of 20 people by the default method (the worst are freaks)."""
+    """Figure 2: worse by the default method than 19 of 20 people (the very worst are freaks)."""
     row = _at_share(test, source, library, 0.95)
     return _line(test, library, Shown(row, source, "fusion"), "default method, against the truth")
 
 
 def warp(test: TestSet, library: Library) -> Picture:
-    """Figure 3: a person whose exemplar is helped by the warp as much as most."""
+    """Figure 3: the warp of the person in the middle of the default method's errors."""
     row = _at_share(test, "gt", library, 0.5)
     shown = Shown(row, "gt", "paper")
     return _line(test, library, shown, "X* (colour) and the exemplar X (grey)", before=True)

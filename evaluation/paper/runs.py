@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from app.commands.console import stage_progress
 from app.drawing.picture import Picture
 from app.drawing.svg import to_svg
 from evaluation.metrics import rigid_error_mm, root_centred_error_mm
@@ -334,7 +335,8 @@ def _systems(frames: Library, options: Options) -> list[System]:
 
 def _frames_library(name: str, scenes: Sequence[Scene], options: Options) -> Library:
     views = draw(scenes, options.entries, options.rng())
-    return write_library(options.out / "libraries" / name, exemplars_of(views))
+    with stage_progress() as done:
+        return write_library(options.out / "libraries" / name, exemplars_of(views), done)
 
 
 def _test_set(views: Views, found: Found, options: Options) -> TestSet:

@@ -66,15 +66,13 @@ def measured_row(label: str, errors: Floats, test: TestSet) -> Row:
 
 
 def comparison(test: TestSet, source: str, systems: Sequence[System], error: Error) -> list[Row]:
-    """Tables 1, 2 and 4: the methods by action."""
-    return [
-        measured_row(
-            system.label,
-            per_person(error, system.lift(test.views, test.seen[source]).answer_mm, test.views),
-            test,
-        )
-        for system in systems
-    ]
+    """Tables 1, 2 and 4: the methods by action; a label says how many people were refused."""
+    rows = []
+    for system in systems:
+        found = system.lift(test.views, test.seen[source])
+        label = f"{system.label} ({found.refused:,} refused)" if found.refused else system.label
+        rows.append(measured_row(label, per_person(error, found.answer_mm, test.views), test))
+    return rows
 
 
 def diagnostic(test: TestSet, library: Library, systems: Sequence[System]) -> list[Row]:
@@ -88,7 +86,7 @@ def diagnostic(test: TestSet, library: Library, systems: Sequence[System]) -> li
 
 
 def warping(test: TestSet, source: str, library: Library) -> list[Row]:
-    """Tables 6 and 7: X, X* and, with 2D from a network, the upper bound."""
+    """Tables 6 and 7: X, X* and, with the true depths, the upper bound of both."""
     seen = test.seen[source]
     found = paper_method(library)(test.views, seen)
     rows = [
@@ -149,7 +147,7 @@ def size_curve(
 
 
 def sizes_up_to(n: int) -> tuple[int, ...]:
-    """1, 2, 5, 10, ... thousand below ``n``, the paper's 18 and 180 thousand among them; and n."""
+    """1, 2, 5, 18, ... thousand below ``n``, the paper's 18 and 180 thousand among them; and n."""
     thousands = (1, 2, 5, 18, 50, 180, 500)
     return (*(1000 * t for t in thousands if 1000 * t < 0.9 * n), n)
 

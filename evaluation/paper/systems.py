@@ -20,6 +20,7 @@ from app.lifting.warp import warp_weak_perspective
 from evaluation.metrics import align, rigid_error_mm
 from evaluation.paper.network import Network, warp_onto
 from evaluation.paper.views import SceneCamera, Views
+from evaluation.progress import followed
 from library_store.library import Library
 from models.pose_lifter import PoseLifter
 
@@ -68,10 +69,14 @@ class Seen2D:
 
 @dataclass(frozen=True)
 class Answers:
-    """``answer_mm`` (N, 14, 3): the method's; ``exemplar_mm``: X, where there is one."""
+    """``answer_mm`` (N, 14, 3): the method's; ``exemplar_mm``: X, where there is one.
+
+    ``refused``: how many people the method does not lift; their joints are all at one place.
+    """
 
     answer_mm: Floats
     exemplar_mm: Floats | None = None
+    refused: int = 0
 
 
 Lift = Callable[[Views, Seen2D], Answers]
@@ -145,7 +150,7 @@ def optimal_exemplars(library: Library, views: Views) -> Floats:
     )
     which = which.reshape(-1)
     best = np.empty((len(frames), joints, 3))
-    for number in range(len(frames)):
+    for number in followed(range(len(frames)), f"optimal exemplars, {library.manifest.name}"):
         truth = views.joints_mm[np.flatnonzero(which == number)[0]]
         rank = squared - 2.0 * (table @ distances(truth[None])[0])
         n = min(CANDIDATES, len(table))
@@ -165,16 +170,18 @@ def _by_lifter(
     def lift(views: Views, seen: Seen2D) -> Answers:
         answer = np.empty_like(views.joints_mm)
         exemplar = np.empty_like(views.joints_mm)
-        for camera, rows in views.by_camera():
-            people = [seen.observation(row, plain=method == "paper") for row in rows.tolist()]
-            lifted = lifter.lift(people, camera.intrinsics, method=method, n_candidates=1)
-            for row, person in zip(rows.tolist(), lifted, strict=True):
-                if not isinstance(person, LiftedPerson):
-                    # A mean pose would flatter.
-                    answer[row] = exemplar[row] = _nothing(seen.points_px[row], camera)
-                    continue
+        refused = 0
+        for row in followed(range(len(views)), f"{method}, {library.manifest.name}"):
+            camera = views.camera_of(row)
+            observation = seen.observation(row, plain=method == "paper")
+            (person,) = lifter.lift([observation], camera.intrinsics, method=method, n_candidates=1)
+            if isinstance(person, LiftedPerson):
                 answer[row], exemplar[row] = person.joints_3d_mm, person.exemplar.joints_mm
-        return Answers(answer, exemplar if method == "paper" else None)
+            else:
+                # A mean pose would flatter.
+                answer[row] = exemplar[row] = _nothing(seen.points_px[row], camera)
+                refused += 1
+        return Answers(answer, exemplar if method == "paper" else None, refused)
 
     return lift
 

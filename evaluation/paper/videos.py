@@ -19,6 +19,7 @@ from app.settings import load_settings
 from evaluation.paper.datasets import h36m_column
 from evaluation.paper.systems import Seen2D
 from evaluation.paper.views import Scene, Views
+from evaluation.progress import followed
 from models.person_detector import PersonBox
 from models.pose_estimator import PoseEstimator
 
@@ -50,7 +51,7 @@ def look_at_videos(views: Views, videos: dict[Key, Path]) -> tuple[Views, Seen2D
     missing: list[str] = []
     rows: list[int] = []
     points, confidence, covariance = [], [], []
-    for camera, own in views.by_camera():
+    for camera, own in followed(views.by_camera(), "videos"):
         scene = views.scenes[int(views.scene[own[0]])]
         key = (scene.clip.subject, scene.action, _trial(scene.clip.action), camera.name)
         if key not in videos:

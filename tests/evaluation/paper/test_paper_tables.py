@@ -11,11 +11,19 @@ import pytest
 
 from app.errors import PoseMatchError
 from evaluation.metrics import rigid_error_mm, root_centred_error_mm
+from evaluation.paper import study
 from evaluation.paper.__main__ import main
 from evaluation.paper.datasets import find_cmu, find_h36m, find_humaneva, h36m_column
 from evaluation.paper.exemplars import exemplars_of, fraction, orbit_rows, write_library
 from evaluation.paper.published import ACTIONS, P1, P1_GT, P2
-from evaluation.paper.systems import Seen2D, known_depths, optimal_exemplars, paper_method
+from evaluation.paper.systems import (
+    Seen2D,
+    System,
+    default_method,
+    known_depths,
+    optimal_exemplars,
+    paper_method,
+)
 from evaluation.paper.videos import find_videos, look_at_videos
 from evaluation.paper.views import draw, look
 from library_store.cameras import rotations
@@ -244,6 +252,22 @@ def test_a_library_of_views_knows_them(users_folder: Path, tmp_path: Path) -> No
     part = write_library(tmp_path / "part", fraction(library, 50, 3))
     assert len(part) == 50
     assert part.match(library.descriptors([0]).reshape(1, 14, 2), None, 1).entries.shape == (1, 1)
+
+
+def test_a_row_says_how_many_people_were_refused(users_folder: Path, tmp_path: Path) -> None:
+    views = draw(find_h36m(users_folder).of(["S1"]), 30, np.random.default_rng(0))
+    library = write_library(tmp_path / "frames", exemplars_of(views))
+    points = views.points_px()
+    points[7] = points[7, 0]
+    test = study.TestSet(views, {"gt": Seen2D(points)}, ("Walk",))
+    systems = [System("default", default_method(library)), System("paper", paper_method(library))]
+    rows = study.comparison(test, "gt", systems, root_centred_error_mm)
+    assert [row.label for row in rows] == ["default (1 refused)", "paper (1 refused)"]
+    # All their joints at one place: as far off as the true ones are from the hips.
+    far = root_centred_error_mm(0 * views.joints_mm[7], views.joints_mm[7]).mean()
+    for row in rows:
+        assert row.mean is not None
+        assert row.mean > 0.99 * far / len(views) > 5
 
 
 def test_orbit_rows_invert_rotations() -> None:
