@@ -108,8 +108,16 @@ def lifted_error_mm(
 
 
 def by_2d(pipeline: Pipeline, renders: list[Render], found: list[Floats | None]) -> str:
-    """Markdown: the 3D error by what 2D was lifted; ``found`` are the network's joints."""
+    """Markdown: the 3D error by what 2D was lifted; ``found`` are the network's joints.
+
+    Every row is of the people whom the network found: the true 2D of the others would flatter it.
+    """
     rng = np.random.default_rng(0)
+    seen = [
+        (render, joints)
+        for render, joints in zip(renders, found, strict=True)
+        if joints is not None
+    ]
 
     def put_right(render: Render, joints_px: Floats) -> Floats:
         near = correct_keypoints(joints_px, render.joints_px)
@@ -122,19 +130,22 @@ def by_2d(pipeline: Pipeline, renders: list[Render], found: list[Floats | None])
         return drawn
 
     def row(label: str, errors: list[float]) -> str:
-        return f"| {label} | {np.nanmean(errors):.0f} | {np.nanmedian(errors):.0f} |"
+        lifted = [error for error in errors if np.isfinite(error)]
+        if len(lifted) < len(errors):
+            label += f" ({len(errors) - len(lifted)} of {len(errors)} refused)"
+        if not lifted:
+            return f"| {label} | - | - |"
+        return f"| {label} | {np.mean(lifted):.0f} | {np.median(lifted):.0f} |"
 
     def network(change: Callable[[Render, Floats], Floats]) -> list[float]:
         return [
-            lifted_error_mm(pipeline, render, change(render, joints))
-            for render, joints in zip(renders, found, strict=True)
-            if joints is not None
+            lifted_error_mm(pipeline, render, change(render, joints)) for render, joints in seen
         ]
 
-    true = [lifted_error_mm(pipeline, r, r.joints_px) for r in renders]
-    assumed = [lifted_error_mm(pipeline, r, r.joints_px, true_focal=False) for r in renders]
+    true = [lifted_error_mm(pipeline, r, r.joints_px) for r, _ in seen]
+    assumed = [lifted_error_mm(pipeline, r, r.joints_px, true_focal=False) for r, _ in seen]
     lines = [
-        "| 2D that is lifted | PA mm, 12: mean | median |",
+        f"| 2D that is lifted, {len(seen)} people | PA mm, 12: mean | median |",
         "|---|---|---|",
         row("the network's, all trusted alike", network(lambda _, joints: joints)),
         row("the same, joints beyond 0.2 torsos put right", network(put_right)),
@@ -144,7 +155,7 @@ def by_2d(pipeline: Pipeline, renders: list[Render], found: list[Floats | None])
     for torsos in NOISE_TORSOS:
         drawn = [
             lifted_error_mm(pipeline, r, noisy(r, torsos))
-            for r in renders
+            for r, _ in seen
             for _ in range(NOISE_DRAWS)
         ]
         lines.append(row(f"true plus noise of {torsos:g} torsos a coordinate", drawn))
@@ -194,6 +205,8 @@ def main() -> None:
             f"| {render.file} | {len(result.people)} | {100 * near[-1].mean():.0f} "
             f"| {similar[-1]:.0f} | {centred[-1]:.0f} |"
         )
+    if not similar:
+        raise SystemExit(f"{args.data}: nobody of {len(renders)} pictures was found and lifted")
     print(
         f"| **mean ({len(similar)} of {len(renders)} lifted)** | | **{100 * np.mean(near):.1f}** "
         f"| **{np.mean(similar):.0f}** | **{np.mean(centred):.0f}** |"
