@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.metrics import Floats
-from evaluation.pose2d import Estimate, networks
+from evaluation.pose2d import Estimate, held_out_photos, networks
 from evaluation.progress import followed
 from library_store.skeleton import LIMB_JOINTS, LSP14
 from models.pck import correct_keypoints, torso_px
 from models.training.cutout import over, place, silhouette, whole
-from models.training.dataset import LabelledCrop, held_out, load
+from models.training.dataset import LabelledCrop, load
 
 COVERED = 0.3
 """Share of the one in front at a joint from which the one behind cannot show it."""
@@ -131,13 +131,10 @@ def main() -> None:
     args = parser.parse_args()
     cv2.setNumThreads(1)
     rng = np.random.default_rng(args.seed)
-    photos = [
-        crop
-        for name in ("photos_a", "photos_b")
-        for crop in load(args.data / f"{name}.tar")
-        if held_out(crop)
-    ]
-    sets = {"lspet_val": load(args.data / "lspet_val.tar"), "held-out photos": photos}
+    sets = {
+        "lspet_val": load(args.data / "lspet_val.tar"),
+        "held-out photos": held_out_photos(args.data),
+    }
     print("| set | network | right, % | exchanged, % |\n|---|---|---|---|")
     for title, crops in sets.items():
         pairs = pairs_of(crops, args.pairs, rng)

@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 
 from app.engine import chosen_networks
 from app.settings import load_settings
+from evaluation.pose2d import held_out_photos
 from evaluation.progress import followed
 from models import PersonBox, PersonDetector, PoseEstimator
 from models.person_detector import Floats, corners, iou
 from models.presence import present
-from models.training.dataset import Image, decode_members, held_out, load
+from models.training.dataset import Image, decode_members, load
 from models.training.scenes import DEV_ONE_IN, mosaic
 
 SURE = 0.7
@@ -147,9 +148,7 @@ def main() -> None:
     rng = np.random.default_rng(args.seed)
     scenes = teacher_scenes(decode_members(args.data / "photos_scenes.tar"), args.labels)
     empty = empty_patches(scenes, rng)
-    people = load(args.data / "lspet_val.tar")
-    for name in ("photos_a", "photos_b"):
-        people += [crop for crop in load(args.data / f"{name}.tar") if held_out(crop)]
+    people = load(args.data / "lspet_val.tar") + held_out_photos(args.data)
     mosaics: list[Scene] = []
     while len(mosaics) < MOSAICS:
         made = mosaic(people, empty, MOSAIC_SIZE, rng)

@@ -126,6 +126,16 @@ def blazepose(folder: Path, variant: str) -> Estimate:
     return estimate
 
 
+def held_out_photos(data: Path) -> list[LabelledCrop]:
+    """The people of ``photos_*.tar`` whose photos no network of ours was trained on."""
+    return [
+        crop
+        for name in ("photos_a", "photos_b")
+        for crop in load(data / f"{name}.tar")
+        if held_out(crop)
+    ]
+
+
 def networks(name: str, weights: Path | None, reference: Path) -> dict[str, Estimate]:
     """Ours and those to compare with, by the name of their column."""
     return {
@@ -220,12 +230,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     compared = networks(args.name, args.weights, args.reference)
     labelled = load(args.data / "lspet_val.tar")
-    photos = [
-        crop
-        for name in ("photos_a", "photos_b")
-        for crop in load(args.data / f"{name}.tar")
-        if held_out(crop)
-    ][: args.photos]
+    photos = held_out_photos(args.data)[: args.photos]
     print(f"## lspet_val: {len(labelled)} people, human labels\n")
     found = {k: find(run, labelled, k) for k, run in compared.items()}
     print(table({k: score(joints, labelled) for k, joints in found.items()}))

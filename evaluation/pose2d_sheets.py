@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 
 from evaluation.metrics import Floats
-from evaluation.pose2d import SCALE, networks
+from evaluation.pose2d import SCALE, held_out_photos, networks
 from evaluation.progress import followed
 from library_store.sheet import draw_bone
 from library_store.skeleton import LSP14
 from models.training.augment import crop_matrix
-from models.training.dataset import Image, LabelledCrop, held_out, load
+from models.training.dataset import Image, LabelledCrop
 
 CELL_PX, PEOPLE_A_SHEET = 152, 10
 
@@ -49,12 +49,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    crops = [
-        crop
-        for name in ("photos_a", "photos_b")
-        for crop in load(args.data / f"{name}.tar")
-        if held_out(crop)
-    ]
+    crops = held_out_photos(args.data)
     order = np.random.default_rng(args.seed).permutation(len(crops))[: args.people]
     compared = networks(args.name, args.weights, args.reference)
     args.out.mkdir(parents=True, exist_ok=True)

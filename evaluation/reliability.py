@@ -67,8 +67,9 @@ class Rejection:
 
     @property
     def share(self) -> float:
-        """Of the oracle's cut, how much the method's own uncertainty achieves."""
-        return (self.everybody - self.kept) / (self.everybody - self.oracle)
+        """Of the oracle's cut, how much the method's own uncertainty achieves; nan of no cut."""
+        cut = self.everybody - self.oracle
+        return (self.everybody - self.kept) / cut if cut > 0 else float("nan")
 
 
 def rejection(error_mm: Floats, sigma_mm: Floats, rejected: float = REJECTED) -> Rejection:

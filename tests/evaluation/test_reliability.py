@@ -30,6 +30,7 @@ def test_rejection_lies_between_nobody_and_the_oracle() -> None:
     assert rejection(error, error).share == pytest.approx(1.0)
     assert rejection(error, rng.normal(size=5_000)).share == pytest.approx(0.0, abs=0.1)
     assert rejection(error, -error).share < -0.2
+    assert np.isnan(rejection(np.ones(10), error[:10]).share)
 
 
 def test_cases_are_told_by_the_truth(data: Path) -> None:
@@ -43,6 +44,19 @@ def test_cases_are_told_by_the_truth(data: Path) -> None:
     )
     sides = [upright[name] for name in upright if "view" in name]
     assert (np.sum(sides, axis=0) == 1).all()
+
+
+def test_somebody_who_faces_the_camera_is_seen_from_the_front() -> None:
+    """Their left is on the right of the picture; y points down, z away from the camera."""
+    down = [-700, -500, *(-500, -250, 0) * 2, *(0, 400, 800) * 2]
+    aside = [0, 0, *(-150,) * 3, *(150,) * 3, *(-100,) * 3, *(100,) * 3]
+    facing = np.array([aside, down, [0] * 14], float).T
+    turned = facing * [-1.0, 1.0, -1.0]
+    sideways = facing[:, [2, 1, 0]]
+    told = cases(np.stack([facing, turned, sideways]) + np.array([0.0, 0.0, 4000.0]))
+    assert told["front view (within 60°)"].tolist() == [True, False, False]
+    assert told["back view (within 60°)"].tolist() == [False, True, False]
+    assert told["side view"].tolist() == [False, False, True]
 
 
 def test_a_rolled_set_projects_onto_its_points(data: Path) -> None:
