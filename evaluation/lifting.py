@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from app.errors import PoseMatchError
 from app.lifting.lifter import Lifter
 from app.lifting.types import Intrinsics, LiftedPerson, Method, NotLiftable
 from evaluation.metrics import Floats, Summary, root_centred_error_mm, summarise
@@ -36,10 +37,17 @@ class Lifted:
 
     @staticmethod
     def of(answers: Sequence[LiftedPerson | NotLiftable], cpu_ms: float) -> Lifted:
-        """Stack answers; ``RuntimeError`` if somebody is not liftable."""
+        """Stack answers; ``PoseMatchError`` if somebody is not liftable.
+
+        A mean over the others would be of easier people.
+        """
         people = tuple(person for person in answers if isinstance(person, LiftedPerson))
-        if len(people) != len(answers):
-            raise RuntimeError("the set holds people who cannot be lifted")
+        for number, answer in enumerate(answers):
+            if isinstance(answer, NotLiftable):
+                raise PoseMatchError(
+                    f"{len(answers) - len(people)} of the set's {len(answers)} people cannot be "
+                    f"lifted, the first number {number}: {answer.reason}"
+                )
         sigmas = [person.sigma_mm for person in people if person.sigma_mm is not None]
         return Lifted(
             np.stack([person.joints_3d_mm for person in people]),
@@ -56,7 +64,7 @@ def lift_all(
     method: Method,
     sigma_px: float | None = None,
 ) -> Lifted:
-    """Lift every person of a set; ``RuntimeError`` if one is not liftable."""
+    """Lift every person of a set; ``PoseMatchError`` if one is not liftable."""
     observations = list(spoilt.observations(sigma_px))
     started = time.process_time()
     answers = lifter.lift(observations, intrinsics, method=method)
@@ -124,8 +132,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add_network_option(parser)
     chosen = parser.parse_args(arguments)
     library = load(chosen.library)
-    lifter = Lifter(library, network=network_of(chosen.network, library))
-    print(f"library {library.manifest.name} {library.manifest.version}, {len(library)} exemplars")
+    network = network_of(chosen.network, library)
+    lifter = Lifter(library, network=network)
+    beside = "matching alone"
+    if network is not None:
+        beside = f"network {network.card.name} {network.card.version}"
+    print(
+        f"library {library.manifest.name} {library.manifest.version}, {len(library)} exemplars; "
+        f"fusion: {beside}"
+    )
     for path in chosen.data:
         data = load_lifting_set(path).first(chosen.people)
         print_table(lifter, data, stated_noise=chosen.stated_noise)

@@ -27,9 +27,11 @@ def rows(views: Views, seen: Seen2D, noise: str, systems: Sequence[System]) -> l
     """A line of the table for each method."""
     lines = []
     for system in systems:
-        found = summarise(system.lift(views, seen).answer_mm, views.joints_mm)
+        answers = system.lift(views, seen)
+        found = summarise(answers.answer_mm, views.joints_mm)
         lines.append(
-            f"| {noise} | {system.label} | {found.p1_mean:.1f} / {found.p1_median:.1f} "
+            f"| {noise} | {answers.labelled(system.label)} "
+            f"| {found.p1_mean:.1f} / {found.p1_median:.1f} "
             f"| {found.p2_mean:.1f} / {found.p2_median:.1f} "
             f"| {found.pa_mean:.1f} / {found.pa_median:.1f} |"
         )

@@ -70,8 +70,8 @@ def comparison(test: TestSet, source: str, systems: Sequence[System], error: Err
     rows = []
     for system in systems:
         found = system.lift(test.views, test.seen[source])
-        label = f"{system.label} ({found.refused:,} refused)" if found.refused else system.label
-        rows.append(measured_row(label, per_person(error, found.answer_mm, test.views), test))
+        errors = per_person(error, found.answer_mm, test.views)
+        rows.append(measured_row(found.labelled(system.label), errors, test))
     return rows
 
 

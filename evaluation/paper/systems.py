@@ -78,6 +78,10 @@ class Answers:
     exemplar_mm: Floats | None = None
     refused: int = 0
 
+    def labelled(self, label: str) -> str:
+        """A row's label, with how many were refused if any."""
+        return f"{label} ({self.refused:,} refused)" if self.refused else label
+
 
 Lift = Callable[[Views, Seen2D], Answers]
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.errors import PoseMatchError
 from evaluation import calibration, lifting
 from evaluation.calibration import Errors, coverage, fit_sigma
 from evaluation.protocols import load_lifting_set, one_corrupted, one_missing
@@ -42,9 +43,23 @@ def test_the_table_has_a_row_for_every_case(
     data: Path, library_directory: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lifting.main(["--library", str(library_directory), "--data", str(data)])
-    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    printed = capsys.readouterr().out.splitlines()
+    assert "fusion: network lifter" in printed[0]
+    rows = [line for line in printed if line.startswith("| ")]
     assert len(rows) == 1 + 3 * 2 * 2
     assert sum("| fusion |" in row for row in rows) == 6
+
+
+def test_somebody_who_cannot_be_lifted_is_named_not_left_out(
+    data: Path, library_directory: Path, tmp_path: Path
+) -> None:
+    bad = tmp_path / "bad.npz"
+    with np.load(data) as held:
+        arrays = dict(held)
+    arrays["joints_2d_px_noise0"][3] = 5.0
+    np.savez(bad, **arrays)
+    with pytest.raises(PoseMatchError, match=r"1 of the set's 12 people .* first number 3: "):
+        lifting.main(["--library", str(library_directory), "--data", str(bad)])
 
 
 def test_calibration_prints_its_constants(
