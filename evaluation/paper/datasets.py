@@ -15,6 +15,7 @@ Whatever is not there is said in the report, and the tables that need it are lef
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -63,10 +64,14 @@ _FOCAL_NUMBERS = 9
 
 @dataclass
 class Found:
-    """What a folder holds: scenes by subject, and what is missing or left out, in words."""
+    """What a folder holds: scenes by subject, and what is missing or left out, in words.
+
+    ``noticed``: what the importer assumed, mended or dropped, and in how many clips.
+    """
 
     scenes: list[Scene] = field(default_factory=list)
     missing: list[str] = field(default_factory=list)
+    noticed: list[str] = field(default_factory=list)
     columns: tuple[str, ...] = ()
     real_cameras: bool = False
 
@@ -199,6 +204,8 @@ def _read(files: Sequence[Path], found: Found) -> list[Clip]:
     """The clips of all files; files and clips that cannot be read are said to be missing."""
     clips, skipped = read_all(files)
     found.missing += map(str, skipped)
+    findings = Counter(finding for clip in clips for finding in clip.findings)
+    found.noticed += [f"{finding} (clips: {n})" for finding, n in findings.items()]
     return clips
 
 

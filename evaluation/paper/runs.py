@@ -145,6 +145,7 @@ def run_users_data(root: Path, options: Options) -> bool:
             reason = "S*/Videos/*.mp4" if h36m.real_cameras else "metadata.xml and the videos"
             told.missing.append(f"{reason}: tables 1, 3, 4 and 6 and the |x lines need them")
         _cameras_said(told, h36m)
+        _noticed(told, h36m)
         _all_tables(told, protocols, options)
         library = protocols.p1_library
     elif h36m.scenes:
@@ -152,6 +153,7 @@ def run_users_data(root: Path, options: Options) -> bool:
             "tables 1 to 8: subjects to learn from and to test on are not all there"
         )
     if humaneva.scenes and library is not None:
+        _noticed(told, humaneva)
         views = look(humaneva.scenes, seconds_apart=HUMANEVA_SECONDS)
         test = _test_set(views, humaneva, options)
         _table9(told, test, library, options, "HumanEva-I, virtual cameras", by_action=True)
@@ -391,3 +393,8 @@ def _what_is_drawn(options: Options) -> str:
 def _cameras_said(told: Report, found: Found) -> None:
     real = "the real ones" if found.real_cameras else "virtual (no metadata.xml)"
     told.say(f"Cameras: {real}.")
+
+
+def _noticed(told: Report, found: Found) -> None:
+    """What the importer did to the poses that errors are measured by: frames may be gone."""
+    told.say("The poses as they were read:", *(f"* {line}" for line in found.noticed))

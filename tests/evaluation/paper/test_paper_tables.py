@@ -67,6 +67,8 @@ def test_every_table_of_a_users_folder(users_folder: Path, tmp_path: Path) -> No
     assert "| paper | 71.63 | 66.60 |" in text
     assert "82.72 | 69.05 |" in text
     assert "Cameras: the real ones" in text
+    assert "* Human3.6M, 32 joints: metres, Z up (clips: 21)" in text
+    assert "* HumanEva, 15 joints: metres, Z up (clips: 12)" in text
     assert "video of S9_Walking, camera" in text
     assert text.count("action '_ALL': not in the paper") == 1
     # Nobody is on the made-up films.
@@ -177,6 +179,21 @@ def test_a_clip_beyond_use_costs_only_itself(tmp_path: Path) -> None:
     assert len(found.scenes) == len(whole.scenes) - 1
     (missing,) = found.missing
     assert "clip 'Validate_S1_Jog_1_chunk0' has no frame" in missing
+
+
+def test_frames_that_the_importer_drops_are_told(tmp_path: Path) -> None:
+    """They are in no mean: whoever reads it must know."""
+    path = tmp_path / "data_3d_h36m.npz"
+    h36m_npz(path, ("Walking 1",))
+    with np.load(path, allow_pickle=True) as packed:
+        held = packed["positions_3d"].item()
+    held["S11"]["Walking 1"][[20, 40], 15] += 3.0
+    np.savez(path, positions_3d=np.array(held, dtype=object))
+    found = find_h36m(tmp_path)
+    assert len(look(found.of(["S11"]))) == 4 * 68
+    (dropped,) = [line for line in found.noticed if "dropped" in line]
+    assert dropped.startswith("2 of 70 frames with a jumping joint")
+    assert dropped.endswith("(clips: 1)")
 
 
 def test_tables_of_free_mocap(tmp_path: Path) -> None:
