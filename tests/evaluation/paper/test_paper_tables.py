@@ -11,7 +11,7 @@ import pytest
 
 from app.errors import PoseMatchError
 from evaluation.metrics import rigid_error_mm, root_centred_error_mm
-from evaluation.paper import study
+from evaluation.paper import figures, study
 from evaluation.paper.__main__ import main
 from evaluation.paper.datasets import find_cmu, find_h36m, find_humaneva, h36m_column
 from evaluation.paper.exemplars import exemplars_of, fraction, orbit_rows, write_library
@@ -285,6 +285,20 @@ def test_a_row_says_how_many_people_were_refused(users_folder: Path, tmp_path: P
     for row in rows:
         assert row.mean is not None
         assert row.mean > 0.99 * far / len(views) > 5
+
+
+def test_drawn_is_who_both_methods_lift(users_folder: Path, tmp_path: Path) -> None:
+    """The paper's method trusts a joint that the network says it has not seen."""
+    views = draw(find_h36m(users_folder).of(["S1"]), 30, np.random.default_rng(0))
+    library = write_library(tmp_path / "frames", exemplars_of(views))
+    points = views.points_px()
+    unseen = np.ones(points.shape[:2])
+    unseen[:, 4] = 0.0
+    sharp = np.broadcast_to(np.eye(2), (*points.shape, 2))
+    test = study.TestSet(views, {"x": Seen2D(points, unseen, sharp)}, ("Walk",))
+    assert figures.liftable(test, "x", library)
+    points[:, 4] = 1e5
+    assert not figures.liftable(test, "x", library)
 
 
 def test_orbit_rows_invert_rotations() -> None:
