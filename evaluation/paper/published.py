@@ -131,7 +131,7 @@ HUMANEVA = (
     _row("X* (warped)", "64.46 69.88 59.99 67.89 79.22", 68.29),
     _row("X (unwarped)", "90.17 95.27 82.74 88.82 103.85", 92.17),
 )
-"""Table 9: HumanEva-I by a library of Human3.6M, Protocol 1, true 2D."""
+"""Table 9: HumanEva-I by a library of Human3.6M, Protocol 1, true 2D; means of the actions'."""
 
 PLATEAUS = {"x": 2e5, "gt": 5e5}
 """Figures 7 and 8: library sizes beyond which the error no longer falls."""

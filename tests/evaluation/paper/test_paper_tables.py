@@ -15,7 +15,7 @@ from evaluation.paper import figures, study
 from evaluation.paper.__main__ import main
 from evaluation.paper.datasets import find_cmu, find_h36m, find_humaneva, h36m_column
 from evaluation.paper.exemplars import exemplars_of, fraction, orbit_rows, write_library
-from evaluation.paper.published import ACTIONS, P1, P1_GT, P2
+from evaluation.paper.published import ACTIONS, HUMANEVA, P1, P1_GT, P2
 from evaluation.paper.systems import (
     Seen2D,
     System,
@@ -285,6 +285,24 @@ def test_a_row_says_how_many_people_were_refused(users_folder: Path, tmp_path: P
     for row in rows:
         assert row.mean is not None
         assert row.mean > 0.99 * far / len(views) > 5
+
+
+def test_the_mean_of_table_9_is_of_the_actions_means(users_folder: Path, tmp_path: Path) -> None:
+    for theirs in HUMANEVA:
+        assert theirs.mean == pytest.approx(np.mean(theirs.actions), abs=0.005)
+    found = find_humaneva(users_folder)
+    views = look(found.scenes)
+    library = write_library(tmp_path / "frames", exemplars_of(views[::7]))
+    few = np.flatnonzero(views.actions == "Jog")[:3]
+    views = views[np.concatenate([few, np.flatnonzero(views.actions == "Walk")[:40]])]
+    test = study.TestSet(views, {"gt": Seen2D(views.points_px())}, found.columns)
+    warped, unwarped = study.transfer(test, library, [])
+    of_frames, _, _ = study.warping(test, "gt", library)
+    assert unwarped.mean == pytest.approx(np.nanmean(unwarped.actions))
+    np.testing.assert_array_equal(unwarped.actions, of_frames.actions)
+    assert of_frames.mean is not None
+    assert of_frames.mean != pytest.approx(unwarped.mean, rel=1e-3)
+    assert warped.mean == pytest.approx(np.nanmean(warped.actions))
 
 
 def test_drawn_is_who_both_methods_lift(users_folder: Path, tmp_path: Path) -> None:
