@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 
@@ -76,6 +76,23 @@ class Answers:
         return sure
 
 
+@dataclass(frozen=True)
+class _Raw(SigmaCalibration):
+    """The spread itself; ``told`` keeps the confidences (14,) that a calibration is given.
+
+    They are not the network's own: joints that contradict the others count as missing.
+    """
+
+    told: list[Floats] = field(default_factory=list)
+
+    def __call__(
+        self, spread_mm: Floats, noise_px: Floats | float, confidence: Floats | None = None
+    ) -> Floats:
+        assert confidence is not None
+        self.told.append(confidence)
+        return super().__call__(spread_mm, noise_px)
+
+
 def find_joints(renders: Path, estimator: PoseEstimator) -> Iterator[Seen]:
     """Every person of a rendered set, found by the true box."""
     images = decode_members(renders)
@@ -96,17 +113,14 @@ def find_joints(renders: Path, estimator: PoseEstimator) -> Iterator[Seen]:
 
 def lift(people: Sequence[Seen], served: Served) -> Answers:
     """What is answered for those who can be lifted, before any calibration."""
-    settings = LiftingSettings()
-    raw = replace(settings, sigma=SigmaCalibration((1.0,) * LSP14.n_joints, 0.0))
-    lifter: Lifter = served.lifter(raw)
+    raw = _Raw((1.0,) * LSP14.n_joints, 0.0)
+    lifter: Lifter = served.lifter(replace(LiftingSettings(), sigma=raw))
     rows = []
     for person in people:
         (answer,) = lifter.lift([person.observation], person.intrinsics, n_candidates=1)
         if isinstance(answer, LiftedPerson):
             error = root_centred_error_mm(answer.joints_3d_mm[None], person.joints_mm[None])[0]
-            sure = person.observation.confidence
-            confidence = np.where(sure >= settings.least_confidence, sure, 0.0)
-            rows.append((answer.sigma_mm, error, confidence, answer.noise_px))
+            rows.append((answer.sigma_mm, error, raw.told[-1], answer.noise_px))
     spread, error, confidence, noise = (
         np.array(column, float) for column in zip(*rows, strict=True)
     )

@@ -10,9 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.lifting.calibration import SigmaCalibration
+from app.lifting.calibration import FUSION_SIGMA, SigmaCalibration
+from app.lifting.geometry import normalised_projection
+from app.lifting.lifter import LiftingSettings
+from app.lifting.types import Intrinsics, LiftedPerson, Observation
 from evaluation import photo_sigma
-from evaluation.photo_sigma import Answers, fit_doubts
+from evaluation.calibration import Served
+from evaluation.networks import OFF
+from evaluation.photo_sigma import Answers, Seen, fit_doubts
 from library_store.build import BuildSettings, build_library
 from library_store.prior import PosePrior
 
@@ -40,6 +45,31 @@ def test_the_fit_finds_what_the_doubts_are_worth() -> None:
     covered = (answers.error_mm <= answers.sigma_mm(fitted)).mean()
     assert covered == pytest.approx(0.68, abs=0.02)
     assert "100%" in photo_sigma.report("fit", replace(answers, error_mm=answers.spread_mm), fitted)
+
+
+def test_what_is_checked_is_what_is_served(tmp_path: Path) -> None:
+    """Also of people with a joint that contradicts the others, which then counts as missing."""
+    directory = tmp_path / "tiny"
+    build_library(directory, PosePrior.load(), BuildSettings(name="tiny", n_poses=2_000, seed=3))
+    served = Served.of(directory, OFF)
+    pinhole = Intrinsics(1150.0, (0.0, 0.0), "request")
+    poses = PosePrior.load().sample(30, np.random.default_rng(6))
+    joints = poses * [1.0, -1.0, -1.0] + [0.0, 0.0, 4000.0]
+    points = 1150.0 * normalised_projection(joints)
+    points[:15, 4] += 400.0
+    confidence = np.random.default_rng(7).uniform(0.1, 1.0, (30, 14))
+    people = [
+        Seen(Observation(seen, sure), pinhole, truth)
+        for seen, sure, truth in zip(points, confidence, joints, strict=True)
+    ]
+    lifter = served.lifter(LiftingSettings())
+    answers = lifter.lift([person.observation for person in people], pinhole)
+    lifted = [answer for answer in answers if isinstance(answer, LiftedPerson)]
+    assert sum("inconsistent_joints" in person.warnings for person in lifted) > 3
+    np.testing.assert_allclose(
+        photo_sigma.lift(people, served).sigma_mm(FUSION_SIGMA),
+        np.stack([person.sigma_mm for person in lifted if person.sigma_mm is not None]),
+    )
 
 
 def test_the_command_measures_photos_with_truth(
