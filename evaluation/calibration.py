@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from app.lifting.calibration import SigmaCalibration
+from app.lifting.calibration import FUSION_SIGMA, SigmaCalibration
 from app.lifting.lifter import Lifter, LiftingSettings
 from evaluation.lifting import Lifted, lift_all
 from evaluation.metrics import Floats, rigid_error_mm, root_centred_error_mm
@@ -204,7 +204,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     halves = [errors.split() for errors in collect_errors(served, data, settings)]
     calibration = fit_sigma([half[0] for half in halves])
-    print(calibration)
+    # What doubts add is evaluation.photo_sigma's; of the joints here nobody has any.
+    doubts = FUSION_SIGMA.person_doubt_mm, FUSION_SIGMA.joint_doubt_mm
+    print(replace(calibration, person_doubt_mm=doubts[0], joint_doubt_mm=doubts[1]))
     report_coverage("fitted half", calibration, [half[0] for half in halves])
     report_coverage("other half", calibration, [half[1] for half in halves])
     _check_probability(served, data.half(1), settings)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from app.errors import PoseMatchError
+from app.lifting.calibration import FUSION_SIGMA
 from evaluation import calibration, lifting
 from evaluation.calibration import Errors, coverage, fit_sigma
 from evaluation.protocols import load_lifting_set, one_corrupted, one_missing
@@ -77,6 +78,8 @@ def test_calibration_prints_its_constants(
     )
     printed = capsys.readouterr().out
     assert "SigmaCalibration(factors=" in printed
+    # Put in place of what is there, it changes nothing that another command fits.
+    assert f"person_doubt_mm={FUSION_SIGMA.person_doubt_mm}, joint_doubt_mm=" in printed
     assert "log P" in printed
     assert printed.count("claimed -> nearest") == 4
 

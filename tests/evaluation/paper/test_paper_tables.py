@@ -71,6 +71,16 @@ def test_every_table_of_a_users_folder(users_folder: Path, tmp_path: Path) -> No
     assert "* HumanEva, 15 joints: metres, Z up (clips: 12)" in text
     assert "video of S9_Walking, camera" in text
     assert text.count("action '_ALL': not in the paper") == 1
+    for by_action, short in (("Table 1:", "X* given x"), ("Table 2:", "X* given gt")):
+        # The same method on the same people.
+        table = text.split(by_action)[1].split("##")[0]
+        *_, mean, median, _ = next(
+            line for line in table.splitlines() if "paper's method, training frames" in line
+        ).split("|")
+        (line,) = [it for it in text.splitlines() if it.startswith(f"| {short} |") and "/" in it][
+            :1
+        ]
+        assert line.endswith(f"| {mean.strip()} / {median.strip()} |")
     # Nobody is on the made-up films.
     assert "figure 5: nobody can be lifted given x" in text
     for name in ("2", "3", "4a", "4c", "6a", "6b", "7", "8"):
