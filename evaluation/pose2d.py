@@ -40,7 +40,7 @@ Estimate = Callable[[LabelledCrop], Floats]
 
 
 LSPET_SIDES = Path(__file__).with_name("lspet_sides.json")
-_LEFT = [j for j in LIMB_JOINTS if LSP14.mirror[j] > j]
+_LEFT = [j for j in LIMB_JOINTS if LSP14.mirror[j] < j]
 _RIGHT = [LSP14.mirror[j] for j in _LEFT]
 
 
