@@ -257,7 +257,7 @@ def _all_tables(told: Report, data: Protocols, options: Options) -> None:
     shown = data.p1_x or p1
     _curves(told, shown, library, "training frames", "", options)
     if options.library is not None:
-        own = load(options.library)
+        own = load(options.library, backend="exact")
         _curves(told, shown, own, own.manifest.name, "-own", options)
     _figures(told, shown, library)
 
@@ -274,7 +274,7 @@ def _curves(
 
         def library_of(size: int) -> Library:
             if size >= len(library):
-                return load(library.directory, verify=False)
+                return load(library.directory, verify=False, backend="exact")
             return write_library(Path(folder) / str(size), fraction(library, size, options.seed))
 
         curve = study.size_curve(test, study.sizes_up_to(len(library)), library_of)
@@ -321,7 +321,7 @@ def _systems(frames: Library, options: Options) -> list[System]:
         System("default by matching alone, training frames", default_method(frames)),
     ]
     if options.library is not None:
-        own = load(options.library)
+        own = load(options.library, backend="exact")
         systems += [
             System(f"paper's method, {own.manifest.name}", paper_method(own)),
             System(f"default by matching alone, {own.manifest.name}", default_method(own)),

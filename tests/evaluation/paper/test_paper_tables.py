@@ -274,6 +274,10 @@ def test_a_library_of_views_knows_them(users_folder: Path, tmp_path: Path) -> No
     # Known depths leave what weak perspective costs.
     bound = rigid_error_mm(known_depths(views, seen), views.joints_mm).mean()
     assert 0 < bound < 30
+    # No graph that would miss some of the nearest, other ones whenever it is built.
+    assert library.index_backend == "exact"
+    again = write_library(tmp_path / "again", exemplars_of(views))
+    assert again.manifest.files == library.manifest.files
     part = write_library(tmp_path / "part", fraction(library, 50, 3))
     assert len(part) == 50
     assert part.match(library.descriptors([0]).reshape(1, 14, 2), None, 1).entries.shape == (1, 1)
