@@ -543,3 +543,40 @@ def test_a_file_that_has_gone_is_said(browser: Browser, server: Server, tmp_path
         page.select_option("[name=method]", "paper")
         expect(page.locator("#refusal")).to_contain_text("file cannot be read")
         expect(page.locator("#refusal button")).to_have_count(0)
+
+
+def test_every_camera_is_let_go_of(browser: Browser, server: Server) -> None:
+    watch = """() => {
+        const devices = navigator.mediaDevices;
+        const open = devices.getUserMedia.bind(devices);
+        window.opened = [];
+        devices.getUserMedia = async (wanted) => {
+            const stream = await open(wanted);
+            opened.push(...stream.getTracks());
+            return stream;
+        };
+    }"""
+    with Visit(browser, server) as page:
+        page.evaluate(watch)
+        page.click("#shoot")
+        page.evaluate(
+            "() => { for (let i = 0; i < 2; i++) document.querySelector('#flip').click() }"
+        )
+        expect(page.locator("#snap")).to_be_enabled(timeout=PATIENCE_MS)
+        expect(page.locator("#camera-notice")).to_be_hidden()
+        page.click("#close")
+        expect(page.locator("#camera")).to_be_hidden()
+        page.wait_for_timeout(500)  # the dialog says a little later that it is closed
+        states = page.evaluate("() => opened.map((track) => track.readyState)")
+        assert states == ["ended"] * 3
+
+
+def test_arrows_with_other_keys_are_the_browsers(browser: Browser, server: Server) -> None:
+    with Visit(browser, server) as page:
+        page.click("[data-sample]")
+        answered(page)
+        first = page.locator("#candidates [role=radio]").first
+        first.focus()
+        page.keyboard.press("Alt+ArrowRight")
+        expect(first).to_be_focused()
+        expect(first).to_have_attribute("aria-checked", "true")

@@ -84,21 +84,24 @@ function listenToCamera(onPhoto) {
 
   async function start() {
     stop();
+    const mine = openings;
     $("snap").disabled = $("timer").disabled = true;
     $("camera-notice").hidden = true;
     try {
       const wanted = { facingMode: facing, width: { ideal: 1280 }, height: { ideal: 960 } };
       const given = await navigator.mediaDevices.getUserMedia({ video: wanted });
-      if (!dialog.open) return given.getTracks().forEach((track) => track.stop());
+      if (mine !== openings) return given.getTracks().forEach((track) => track.stop());
       stream = given;
       video.srcObject = stream;
       video.classList.toggle("facing", facing === "user");
       await video.play();
       const devices = await navigator.mediaDevices.enumerateDevices();
+      if (mine !== openings) return;
       $("flip").hidden = devices.filter(({ kind }) => kind === "videoinput").length < 2;
       $("snap").disabled = $("timer").disabled = false;
       $("snap").focus();
     } catch (error) {
+      if (mine !== openings) return;
       $("camera-notice").hidden = false;
       $("camera-notice").textContent =
         error.name === "NotAllowedError"
@@ -107,7 +110,9 @@ function listenToCamera(onPhoto) {
     }
   }
 
+  /** Let go of the camera, also of one that is still being opened. */
   function stop() {
+    openings++;
     clearTimeout(countdown);
     $("timer").textContent = "in 5 seconds";
     stream?.getTracks().forEach((track) => track.stop());
