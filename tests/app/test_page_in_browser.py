@@ -580,3 +580,16 @@ def test_arrows_with_other_keys_are_the_browsers(browser: Browser, server: Serve
         page.keyboard.press("Alt+ArrowRight")
         expect(first).to_be_focused()
         expect(first).to_have_attribute("aria-checked", "true")
+
+
+def test_the_reference_asks_under_a_path_prefix_too(browser: Browser, server: Server) -> None:
+    def without_prefix(route: Route) -> None:
+        route.fulfill(response=route.fetch(url=route.request.url.replace("/prefix/", "/")))
+
+    with Visit(browser, server) as page:
+        page.route("**/prefix/**", without_prefix)
+        page.goto(f"{server.url}/prefix/docs")
+        page.locator("#operations-info-get_info_v1_info_get").click()
+        page.locator("button.execute").click()
+        expect(page.locator(".request-url pre")).to_have_text(f"{server.url}/prefix/v1/info")
+        expect(page.locator(".live-responses-table")).to_contain_text("max_batch_images")
