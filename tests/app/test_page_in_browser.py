@@ -593,3 +593,20 @@ def test_the_reference_asks_under_a_path_prefix_too(browser: Browser, server: Se
         page.locator("button.execute").click()
         expect(page.locator(".request-url pre")).to_have_text(f"{server.url}/prefix/v1/info")
         expect(page.locator(".live-responses-table")).to_contain_text("max_batch_images")
+
+
+def test_a_photo_that_only_the_service_can_decode(browser: Browser, server: Server) -> None:
+    """As HEIC in most browsers: its joints are drawn all the same."""
+    blind = "() => { window.createImageBitmap = () => Promise.reject(new Error()) }"
+    with Visit(browser, server) as page:
+        page.evaluate(blind)
+        upload(page, "strange.jpg", (RENDERS / "006.jpg").read_bytes())
+        answered(page)
+        expect(page.locator("#welcome")).to_be_hidden()
+        photo = picture(page, "#photo")
+        assert colour_share(photo, (0x33, 0x7A, 0xFF)) > 0.002
+        assert colour_share(photo, (0xFF, 0xA8, 0x4A)) > 0.002
+        upload(page, "notes.txt", b"hello")
+        expect(page.locator("#refusal")).to_be_visible(timeout=PATIENCE_MS)
+        expect(page.locator("#photo")).to_be_hidden()
+        expect(page.locator("#welcome")).to_be_visible()

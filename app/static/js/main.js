@@ -131,6 +131,7 @@ function show(answer, query, key) {
   Object.assign(state, { answer, selected: 0 });
   $("findings").inert = $("stage-frame").inert = false;
   caption(captionOf(state.name, answer));
+  $("welcome").hidden = true;
   photoView.overlay(answer, 0);
   panels.showAnswer(answer, 0);
   stage?.show(answer, 0, state.bitmap);
@@ -142,6 +143,7 @@ function refuse(error, canBeRead = true) {
   state.answer = null;
   $("findings").inert = $("stage-frame").inert = false;
   photoView.overlay(null, 0);
+  $("welcome").hidden = state.bitmap !== null;
   panels.showAnswer(null, 0);
   stage?.show(null, 0, null);
   caption(state.name);
