@@ -43,6 +43,7 @@ def openapi_document(app: FastAPI) -> dict[str, Any]:
         version=app.version,
         description=app.description,
         routes=app.routes,
+        servers=[{"url": "."}],  # beside the document, also under a path prefix
     )
     components = document["components"]["schemas"]
     for model in (schemas.LiftRequest, schemas.Problem):

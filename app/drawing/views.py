@@ -43,6 +43,8 @@ _BONES = (*LSP14.edges, (R_HIP, L_HIP))
 _GRID_STEP_MM = 500.0
 _SURE = 0.5
 """Confidence from which a joint is drawn as one that is there."""
+_MOST_ASPECT = 4.0
+"""Photos that are wider than this many heights get bars above and below."""
 _NEAR = 1.7
 """The camera is drawn at most this many extents of the people away from them."""
 
@@ -91,16 +93,17 @@ def draw_result(photo: Photo, result: PhotoResult, *, height_px: int = 720) -> P
 
 def draw_overlay(photo: Photo, people: Sequence[SeenPerson], *, height_px: int) -> Picture:
     """The photo at this height with limbs and joints; faint and hollow where unsure."""
-    scale = height_px / photo.pixels_bgr.shape[0]
-    width_px = max(1, round(scale * photo.pixels_bgr.shape[1]))
-    marks: list[Mark] = [
-        Photograph(photo.pixels_bgr, np.zeros(2), float(width_px), float(height_px))
-    ]
+    rows, columns = photo.pixels_bgr.shape[:2]
+    scale = height_px * min(1 / rows, _MOST_ASPECT / columns)
+    width_px = max(1, round(scale * columns))
+    drawn_px = max(1, round(scale * rows))
+    corner = np.array([0.0, (height_px - drawn_px) // 2])
+    marks: list[Mark] = [Photograph(photo.pixels_bgr, corner, float(width_px), float(drawn_px))]
     thickness = max(2.0, height_px / 180)
     for person in people:
         # Pixel centres are at whole numbers in results, at halves in pictures.
         decoded_px = (person.joints_px - photo.offset_px) / photo.reduction
-        joints = (decoded_px + 0.5) * scale
+        joints = (decoded_px + 0.5) * scale + corner
         sure = person.present & (
             np.ones(len(joints), bool)
             if person.confidence is None

@@ -4,7 +4,7 @@
 
     ClientError
     ├── RefusedError       the service answered, with an error
-    └── UnreachableError   there was no answer before the deadline
+    └── UnreachableError   there was no answer, or none that can be read
 """
 
 from __future__ import annotations
@@ -31,7 +31,11 @@ class RefusedError(ClientError):
         self.status = status
         self.problem = dict(problem)
         self.retry_after_s = retry_after_s
-        super().__init__(f"{status}: {self.detail}")
+        super().__init__(status, self.problem, retry_after_s)  # so that it can be pickled
+
+    def __str__(self) -> str:
+        """Status and detail."""
+        return f"{self.status}: {self.detail}"
 
     @property
     def slug(self) -> str:
@@ -51,4 +55,4 @@ class RefusedError(ClientError):
 
 
 class UnreachableError(ClientError):
-    """No answer came before the deadline; the cause is httpx's error."""
+    """No answer came before the deadline, or none can; the cause is httpx's error."""

@@ -15,6 +15,8 @@ import httpx
 from posematch_client.errors import RefusedError, UnreachableError
 
 RETRIED_STATUSES = frozenset({429, 502, 503, 504})
+_HOPELESS = (httpx.UnsupportedProtocol, httpx.LocalProtocolError)
+"""Errors of the request itself, such as an address without http:// or a key with a line's end."""
 _DOUBLINGS = 100
 """Of the pause at most: no number holds a thousand."""
 
@@ -74,11 +76,13 @@ class Attempts:
             return None
         return self._pause(retry_after_s(response))
 
-    def pause_after_failure(self, error: httpx.TransportError) -> float:
+    def pause_after_failure(self, error: httpx.RequestError) -> float:
         """How long to wait before the next try; ``UnreachableError`` when there is none."""
+        said = str(error) or type(error).__name__
+        if isinstance(error, _HOPELESS):
+            raise UnreachableError(f"cannot be sent: {said}") from error
         pause = self._pause(None)
         if pause is None:
-            said = str(error) or type(error).__name__
             raise UnreachableError(f"no answer after {self._made} tries: {said}") from error
         return pause
 
@@ -109,7 +113,7 @@ def retry_after_s(response: httpx.Response) -> float | None:
         return float(text)
     try:
         when = parsedate_to_datetime(text)
-    except ValueError:
+    except (ValueError, OverflowError):
         return None
     if when.tzinfo is None:
         when = when.replace(tzinfo=UTC)

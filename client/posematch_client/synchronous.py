@@ -75,7 +75,7 @@ class Client:
                 response = self._http.request(
                     call.method, call.path, timeout=attempts.left_s(), **call.keywords
                 )
-            except httpx.TransportError as error:
+            except httpx.RequestError as error:
                 pause_s = attempts.pause_after_failure(error)
             else:
                 again_s = attempts.pause_after(response)

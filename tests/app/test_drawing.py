@@ -194,3 +194,22 @@ def test_files(ending: str) -> None:
 def test_no_other_files() -> None:
     with pytest.raises(ValueError, match=r"\.png"):
         encode_picture(Picture(4, 4, (0, 0, 0)), ".gif")
+
+
+@pytest.mark.parametrize("shape", [(1, 40_000), (300, 9_000)])
+def test_the_widest_photos_become_files_too(
+    seen: tuple[Photo, PhotoResult], shape: tuple[int, int]
+) -> None:
+    """JPEG and WebP end at 65,535 and 16,383 pixels; the joints stay where the photo is."""
+    data = cv2.imencode(".png", np.full((*shape, 3), 90, np.uint8))[1].tobytes()
+    photo = decode_photo(data, max_pixels=10**7, side_px=1280)
+    result = replace(seen[1], width_px=photo.width_px, height_px=photo.height_px)
+    person = replace(result.people[0], joints_px=np.tile([[100.0, shape[0] / 2 - 0.5]], (14, 1)))
+    picture = draw_result(photo, replace(result, people=(person,)), height_px=720)
+    assert (picture.width, picture.height) == (2880 + 2 * 720, 720)
+    disc = next(mark for mark in picture.marks if isinstance(mark, Disc))
+    np.testing.assert_allclose(disc.centre, [100.5 * 2880 / shape[1], 360], atol=1)
+    for ending in (".jpg", ".webp"):
+        pixels = cv2.imdecode(np.frombuffer(encode_picture(picture, ending), np.uint8), 1)
+        assert pixels is not None
+        assert pixels.shape == (720, 4320, 3)

@@ -180,6 +180,7 @@ def test_nobody_and_many(server: Server, renders: list[Render]) -> None:
             "people.0.joints_2d.0.x_px",
         ),
         ({"people": [{"joints_2d": [{"name": "neck", "x_px": 1}]}]}, "people.0.joints_2d.0.y_px"),
+        ({"principal_point_px": [10, 1e7]}, "principal_point_px.1"),
     ],
 )
 def test_bad_values_are_named(

@@ -430,3 +430,183 @@ def test_without_webgl(playwright: Playwright, server: Server) -> None:
             visit.complaints.clear()
     finally:
         started.close()
+
+
+_WATCH_DECODING = """() => {
+    const decode = createImageBitmap;
+    window.decoded = [];
+    window.createImageBitmap = async (...photo) => {
+        const bitmap = await decode(...photo);
+        decoded.push(bitmap);
+        if (decoded.length === 1) await new Promise((go) => { window.goOn = go; });
+        return bitmap;
+    };
+}"""
+
+
+def test_the_photo_chosen_last_counts(
+    browser: Browser, server: Server, renders: list[Render]
+) -> None:
+    with Visit(browser, server) as page:
+        page.evaluate(_WATCH_DECODING)
+        upload(page, "slow.jpg", renders[0].data)
+        expect(page.locator("#photo-caption")).to_contain_text("slow.jpg")
+        upload(page, "quick.jpg", renders[1].data)
+        answered(page)
+        page.evaluate("() => goOn()")
+        # What is decoded too late is let go of: neither view can come to show it.
+        assert page.evaluate("() => decoded.map((it) => it.width)") == [0, 640]
+        expect(page.locator("#photo-caption")).to_contain_text("quick.jpg")
+
+
+def test_a_sample_that_comes_late_is_not_shown(browser: Browser, server: Server) -> None:
+    held: list[Route] = []
+    with Visit(browser, server) as page:
+        page.route("**/dance.jpg", lambda route: held.append(route))
+        # The pictures on the buttons are the browser's already; the photo is fetched anew.
+        page.click("[data-sample='dance.jpg']")
+        page.click("[data-sample='step.jpg']")
+        answered(page)
+        expect(page.locator("#photo-caption")).to_contain_text("step.jpg")
+        with page.expect_response("**/dance.jpg"):
+            held[0].continue_()
+        page.wait_for_timeout(500)
+        expect(page.locator("#photo-caption")).to_contain_text("step.jpg")
+
+
+def test_a_lost_server_is_said_and_asked_again(browser: Browser, server: Server) -> None:
+    is_lost = True
+    with Visit(browser, server) as page:
+
+        def maybe(route: Route) -> None:
+            route.abort() if is_lost else route.continue_()
+
+        page.route("**/samples/run.jpg", maybe)
+        page.route("**/v1/poses?*", maybe)
+        refusal = page.locator("#refusal")
+        page.click("[data-sample='run.jpg']")
+        expect(refusal).to_contain_text("cannot be reached", timeout=PATIENCE_MS)
+        expect(refusal.locator("button")).to_have_count(0)
+        page.click("[data-sample='step.jpg']")
+        expect(page.locator("#photo")).to_be_visible()
+        again = refusal.locator("button")
+        expect(again).to_be_visible(timeout=PATIENCE_MS)
+        is_lost = False
+        again.click()
+        answered(page)
+        expect(refusal).to_be_hidden()
+
+
+def test_what_is_of_the_last_photo_cannot_be_used(
+    browser: Browser, server: Server, two_people: bytes
+) -> None:
+    held: list[Route] = []
+    with Visit(browser, server) as page:
+        upload(page, "two.jpg", two_people)
+        answered(page)
+        page.route("**/v1/poses?*", lambda route: held.append(route))
+        upload(page, "next.jpg", (RENDERS / "006.jpg").read_bytes())
+        expect(page.locator("#photo-caption")).to_contain_text("next.jpg: asking")
+        assert page.evaluate("() => document.querySelector('#findings').inert")
+        for picked in ("#people [aria-checked=false]", "#candidates [aria-checked=false]"):
+            box = page.locator(picked).first.bounding_box()
+            assert box is not None
+            page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        held[0].continue_()
+        expect(page.locator("#photo-caption")).to_contain_text("one person", timeout=PATIENCE_MS)
+        assert not page.evaluate("() => document.querySelector('#findings').inert")
+        # And when it is refused there is nobody left in the photo to be picked.
+        page.unroute("**/v1/poses?*")
+        upload(page, "two.jpg", two_people)
+        expect(page.locator("#photo-caption")).to_contain_text("2 people", timeout=PATIENCE_MS)
+        chest = json.loads(page.locator("#json").text_content() or "")["people"][1]["joints_2d"][1]
+        page.route("**/v1/poses?*", lambda route: route.abort())
+        page.click("#options summary")
+        page.select_option("[name=method]", "paper")
+        expect(page.locator("#refusal")).to_be_visible(timeout=PATIENCE_MS)
+        photo = page.locator("#photo").bounding_box()
+        assert photo is not None
+        scale = photo["width"] / 1280
+        page.locator("#photo").click(
+            position={"x": scale * chest["x_px"], "y": scale * chest["y_px"]}
+        )
+
+
+def test_a_file_that_has_gone_is_said(browser: Browser, server: Server, tmp_path: Path) -> None:
+    file = tmp_path / "mine.jpg"
+    file.write_bytes((RENDERS / "006.jpg").read_bytes())
+    with Visit(browser, server) as page:
+        page.locator("#file").set_input_files(file)
+        answered(page)
+        file.unlink()
+        page.click("#options summary")
+        page.select_option("[name=method]", "paper")
+        expect(page.locator("#refusal")).to_contain_text("file cannot be read")
+        expect(page.locator("#refusal button")).to_have_count(0)
+
+
+def test_every_camera_is_let_go_of(browser: Browser, server: Server) -> None:
+    watch = """() => {
+        const devices = navigator.mediaDevices;
+        const open = devices.getUserMedia.bind(devices);
+        window.opened = [];
+        devices.getUserMedia = async (wanted) => {
+            const stream = await open(wanted);
+            opened.push(...stream.getTracks());
+            return stream;
+        };
+    }"""
+    with Visit(browser, server) as page:
+        page.evaluate(watch)
+        page.click("#shoot")
+        page.evaluate(
+            "() => { for (let i = 0; i < 2; i++) document.querySelector('#flip').click() }"
+        )
+        expect(page.locator("#snap")).to_be_enabled(timeout=PATIENCE_MS)
+        expect(page.locator("#camera-notice")).to_be_hidden()
+        page.click("#close")
+        expect(page.locator("#camera")).to_be_hidden()
+        page.wait_for_timeout(500)  # the dialog says a little later that it is closed
+        states = page.evaluate("() => opened.map((track) => track.readyState)")
+        assert states == ["ended"] * 3
+
+
+def test_arrows_with_other_keys_are_the_browsers(browser: Browser, server: Server) -> None:
+    with Visit(browser, server) as page:
+        page.click("[data-sample]")
+        answered(page)
+        first = page.locator("#candidates [role=radio]").first
+        first.focus()
+        page.keyboard.press("Alt+ArrowRight")
+        expect(first).to_be_focused()
+        expect(first).to_have_attribute("aria-checked", "true")
+
+
+def test_the_reference_asks_under_a_path_prefix_too(browser: Browser, server: Server) -> None:
+    def without_prefix(route: Route) -> None:
+        route.fulfill(response=route.fetch(url=route.request.url.replace("/prefix/", "/")))
+
+    with Visit(browser, server) as page:
+        page.route("**/prefix/**", without_prefix)
+        page.goto(f"{server.url}/prefix/docs")
+        page.locator("#operations-info-get_info_v1_info_get").click()
+        page.locator("button.execute").click()
+        expect(page.locator(".request-url pre")).to_have_text(f"{server.url}/prefix/v1/info")
+        expect(page.locator(".live-responses-table")).to_contain_text("max_batch_images")
+
+
+def test_a_photo_that_only_the_service_can_decode(browser: Browser, server: Server) -> None:
+    """As HEIC in most browsers: its joints are drawn all the same."""
+    blind = "() => { window.createImageBitmap = () => Promise.reject(new Error()) }"
+    with Visit(browser, server) as page:
+        page.evaluate(blind)
+        upload(page, "strange.jpg", (RENDERS / "006.jpg").read_bytes())
+        answered(page)
+        expect(page.locator("#welcome")).to_be_hidden()
+        photo = picture(page, "#photo")
+        assert colour_share(photo, (0x33, 0x7A, 0xFF)) > 0.002
+        assert colour_share(photo, (0xFF, 0xA8, 0x4A)) > 0.002
+        upload(page, "notes.txt", b"hello")
+        expect(page.locator("#refusal")).to_be_visible(timeout=PATIENCE_MS)
+        expect(page.locator("#photo")).to_be_hidden()
+        expect(page.locator("#welcome")).to_be_visible()

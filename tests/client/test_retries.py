@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
@@ -223,3 +224,44 @@ def test_pauses_stay_numbers_however_many_tries() -> None:
     attempts = Attempts(Retries(deadline_s=1e9).until_deadline(), clock, lambda _, most: most)
     pauses = [attempts.pause_after(refusal(502)) for _ in range(1100)]
     assert pauses[-1] == Retries().longest_pause_s
+
+
+@both_ways
+@pytest.mark.parametrize(
+    "error",
+    [
+        httpx.UnsupportedProtocol("Request URL is missing an 'http://' or 'https://' protocol."),
+        httpx.LocalProtocolError("Illegal header value b'Bearer key\\n'"),
+    ],
+)
+def test_what_cannot_be_sent_is_not_tried_again(way: str, error: Exception) -> None:
+    script = Script(error)
+    with pytest.raises(UnreachableError, match=r"cannot be sent: (Request URL|Illegal header)"):
+        ask(script, QUICK, way)
+    assert len(script.requests) == 1
+
+
+def test_an_address_without_its_protocol_is_said() -> None:
+    said = pytest.raises(UnreachableError, match="cannot be sent")
+    with Client("127.0.0.1:8000", retries=QUICK) as client, said:
+        client.info()
+
+
+@both_ways
+def test_an_answer_that_cannot_be_unpacked_is_asked_for_again(way: str) -> None:
+    script = Script(httpx.DecodingError("incorrect header check"))
+    assert ask(script, QUICK, way) == {"people": []}
+    with pytest.raises(UnreachableError, match="incorrect header check"):
+        ask(Script(httpx.DecodingError("incorrect header check")), Retries(attempts=1), way)
+
+
+def test_a_date_beyond_all_calendars_is_no_date() -> None:
+    text = "1 Jan 99999999999999999999 00:00:00 GMT"
+    assert retry_after_s(refusal(503, **{"Retry-After": text})) is None
+
+
+def test_refusals_come_through_process_pools() -> None:
+    error = RefusedError(503, {"type": "urn:posematch:problem:overloaded", "detail": "busy"}, 2.0)
+    again = pickle.loads(pickle.dumps(error))
+    assert str(again) == str(error) == "503: busy"
+    assert (again.status, again.slug, again.retry_after_s) == (503, "overloaded", 2.0)

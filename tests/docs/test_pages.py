@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from itertools import pairwise
@@ -154,3 +155,16 @@ def test_the_packages_of_all_providers_are_where_the_refusal_sends_to() -> None:
     operations = (ROOT / "docs" / "operations.md").read_text()
     for package in PACKAGES.values():
         assert re.search(rf"pip (un)?install {package}`|`{package}`", operations), package
+
+
+def test_the_answer_in_the_readme_is_of_the_network_served() -> None:
+    """Its other numbers need the whole library: `curl` as it stands there gives them anew."""
+    shown = re.search(
+        r'"model": {"name": "([\w-]+)", "version": "([\d.]+)", "sha256": "(\w+)…"}',
+        (ROOT / "README.md").read_text(),
+    )
+    assert shown is not None
+    name, version, digest = shown.groups()
+    card = json.loads((ROOT / "models" / "weights" / f"{name}.json").read_text())
+    assert version == card["version"], "renew the answer in README.md"
+    assert card["sha256"].startswith(digest)

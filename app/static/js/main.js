@@ -4,7 +4,7 @@ import { Refusal, curlCommand, estimate, fetchInfo } from "./api.js";
 import { Panels } from "./panels.js";
 import { PhotoView } from "./photo.js";
 import { listenForPhotos } from "./sources.js";
-import { captionOf, refusalInWords, viewInWords } from "./words.js";
+import { captionOf, failureInWords, viewInWords } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 
@@ -12,6 +12,8 @@ const $ = (id) => document.getElementById(id);
 const state = { photo: null, name: "", bitmap: null, answer: null, selected: 0 };
 let stage = null;
 let inFlight = null;
+let turns = 0;
+let limits = null;
 
 const photoView = new PhotoView($("photo"), { onPerson: select, onJoint: light });
 const panels = new Panels({ onPerson: select, onCandidate: pickCandidate, onJoint: light });
@@ -28,17 +30,42 @@ for (const query of ["(prefers-color-scheme: dark)", "(min-width: 40rem)"]) {
 addEventListener("resize", () => panels.redraw());
 openStage();
 
-/** Take in a photo, show it and ask about it. */
-async function open(photo, name) {
+/**
+ * Take in a photo, show it and ask about it. The last one that was chosen counts, however long each
+ * takes to be had and decoded.
+ *
+ * @param {Blob | Promise<Blob>} source
+ * @param {string} name
+ */
+async function open(source, name) {
   inFlight?.abort();
-  Object.assign(state, { photo, name, answer: null, selected: 0 });
-  // Not every browser decodes what is dropped here; the service says why it does not either.
-  state.bitmap = await createImageBitmap(photo, { imageOrientation: "from-image" }).catch(() => null);
-  if (state.photo !== photo) return;
-  $("welcome").hidden = state.bitmap !== null;
-  photoView.show(state.bitmap);
+  inFlight = null;
+  state.photo = null; // until then there is nothing to ask about
+  const turn = ++turns;
+  $("scan").hidden = true;
+  $("findings").inert = $("stage-frame").inert = true; // of another photo
+  $("refusal").hidden = true;
+  caption(`${name}: opening …`);
+  let photo = null;
+  let bitmap = null;
+  let failure = null;
+  try {
+    photo = await source;
+    // Not every browser decodes what is dropped here; the service says why it does not either.
+    bitmap = await createImageBitmap(photo, { imageOrientation: "from-image" }).catch(() => null);
+  } catch (error) {
+    failure = error;
+  }
+  if (turn !== turns) {
+    bitmap?.close();
+    return;
+  }
+  Object.assign(state, { photo, name, bitmap, answer: null, selected: 0 });
+  $("welcome").hidden = bitmap !== null;
+  photoView.show(bitmap);
   $("photo").setAttribute("aria-label", `The photo ${name}`);
-  await ask();
+  if (failure) refuse(failure);
+  else await ask();
 }
 
 /** Ask about the photo with the options as they are. */
@@ -46,35 +73,48 @@ async function ask() {
   inFlight?.abort();
   const mine = new AbortController();
   inFlight = mine;
+  const { photo } = state;
   const { query, key } = options();
   $("refusal").hidden = true;
   const scan = setTimeout(() => ($("scan").hidden = false), 250);
   caption(`${state.name}: asking …`);
+  let answer;
   try {
-    await refuseTooLarge(key);
-    const answer = await estimate(state.photo, query, {
+    await refuseTooLarge(photo, key);
+    answer = await estimate(photo, query, {
       key,
       signal: mine.signal,
       onWait: (seconds, problem) =>
         caption(`${problem?.title ?? "Busy"}: asking again in ${Math.ceil(seconds)} s`),
     });
-    if (mine === inFlight) show(answer, query, key);
   } catch (error) {
-    if (mine === inFlight && error.name !== "AbortError") refuse(error);
+    const canBeRead = await isReadable(photo);
+    if (mine === inFlight && error.name !== "AbortError") refuse(error, canBeRead);
+    return;
   } finally {
     clearTimeout(scan);
     if (mine === inFlight) $("scan").hidden = true;
   }
+  if (mine === inFlight) show(answer, query, key);
 }
 
 /** A body over the limit is cut off by the server, which browsers report as a lost connection. */
-async function refuseTooLarge(key) {
-  if (state.photo.size < 1e6) return;
-  const limit = (await fetchInfo(key))?.limits.max_body_bytes;
-  if (state.photo.size > limit) {
-    const detail = `the file has ${state.photo.size} bytes, the limit is ${limit}`;
+async function refuseTooLarge(photo, key) {
+  if (photo.size < 1e6) return;
+  limits ??= (await fetchInfo(key))?.limits; // once: it counts towards a key's quota
+  const limit = limits?.max_body_bytes;
+  if (photo.size > limit) {
+    const detail = `the file has ${photo.size} bytes, the limit is ${limit}`;
     throw new Refusal(413, { type: "urn:posematch:problem:body-too-large", detail });
   }
+}
+
+/** Whether the file is still there as it was chosen; fetch does not say that it is not. */
+function isReadable(photo) {
+  return photo.slice(0, 1).arrayBuffer().then(
+    () => true,
+    () => false,
+  );
 }
 
 function options() {
@@ -89,7 +129,9 @@ function options() {
 
 function show(answer, query, key) {
   Object.assign(state, { answer, selected: 0 });
+  $("findings").inert = $("stage-frame").inert = false;
   caption(captionOf(state.name, answer));
+  $("welcome").hidden = true;
   photoView.overlay(answer, 0);
   panels.showAnswer(answer, 0);
   stage?.show(answer, 0, state.bitmap);
@@ -97,18 +139,23 @@ function show(answer, query, key) {
   $("curl").textContent = curlCommand(state.name, type, query.toString(), key !== "");
 }
 
-function refuse(error) {
+function refuse(error, canBeRead = true) {
   state.answer = null;
+  $("findings").inert = $("stage-frame").inert = false;
+  photoView.overlay(null, 0);
+  $("welcome").hidden = state.bitmap !== null;
   panels.showAnswer(null, 0);
   stage?.show(null, 0, null);
   caption(state.name);
-  const words =
-    error instanceof Refusal
-      ? refusalInWords(error)
-      : { headline: "The server cannot be reached.", advice: "Is it still running?", detail: error.message };
+  const words = failureInWords(error, canBeRead);
   const small = document.createElement("small");
   small.textContent = words.detail + (words.id ? ` (request ${words.id})` : "");
   $("refusal").replaceChildren(`${words.headline} ${words.advice}`, small);
+  if (words.mayPass && state.photo) {
+    const again = document.createElement("button");
+    Object.assign(again, { type: "button", textContent: "Ask again", onclick: ask });
+    $("refusal").append(again);
+  }
   $("refusal").hidden = false;
   if (error.status === 401) {
     $("options").open = true;

@@ -30,7 +30,7 @@ function fillRadioGroup(group, buttons, checked, onPick) {
   group.replaceChildren(...buttons);
   group.onkeydown = (event) => {
     const step = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 }[event.key];
-    if (!step) return;
+    if (!step || event.altKey || event.ctrlKey || event.metaKey) return;
     event.preventDefault();
     const now = buttons.indexOf(document.activeElement);
     const next = (now + step + buttons.length) % buttons.length;

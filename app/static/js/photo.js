@@ -39,11 +39,13 @@ export class PhotoView {
     this.#fit();
   }
 
-  /** Draw the people of `answer`; the selected one stands out. */
+  /** Draw the people of `answer`; the selected one stands out. Without the photo, they alone. */
   overlay(answer, selected) {
     this.#answer = answer;
     this.#selected = selected;
-    this.#draw();
+    this.#canvas.hidden = !this.#bitmap && !answer;
+    if (this.#bitmap) this.#draw();
+    else this.#fit();
   }
 
   /** Point out joint `index` of the selected person; -1 for none. */
@@ -60,7 +62,7 @@ export class PhotoView {
   }
 
   #fit() {
-    if (!this.#bitmap) return;
+    if (!this.#bitmap && !this.#answer) return;
     const { clientWidth, clientHeight } = this.#canvas.parentElement;
     const [width, height] = this.#size();
     const scale = Math.min(clientWidth / width, clientHeight / height);
@@ -70,10 +72,10 @@ export class PhotoView {
   }
 
   #draw() {
-    const ready = this.#bitmap && prepared(this.#canvas);
+    const ready = (this.#bitmap || this.#answer) && prepared(this.#canvas);
     if (!ready) return;
     const { context, width, height } = ready;
-    context.drawImage(this.#bitmap, 0, 0, width, height);
+    if (this.#bitmap) context.drawImage(this.#bitmap, 0, 0, width, height);
     if (!this.#answer) return;
     const others = this.#answer.people.map((_, index) => index).filter((index) => index !== this.#selected);
     for (const index of [...others, this.#selected]) {

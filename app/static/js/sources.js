@@ -1,11 +1,13 @@
 // Where photos come from: a file, a drop, the clipboard, a sample, the camera.
 
+import { Refusal } from "./api.js";
+
 const $ = (id) => document.getElementById(id);
 
 /**
  * Wire all sources.
  *
- * @param {(photo: Blob, name: string) => void} onPhoto
+ * @param {(photo: Blob | Promise<Blob>, name: string) => void} onPhoto
  */
 export function listenForPhotos(onPhoto) {
   const take = (file) => file && onPhoto(file, file.name || "pasted.png");
@@ -43,12 +45,18 @@ export function listenForPhotos(onPhoto) {
     take(file);
   });
 
-  $("samples").addEventListener("click", async (event) => {
+  $("samples").addEventListener("click", (event) => {
     const name = event.target.closest("[data-sample]")?.dataset.sample;
-    if (name) onPhoto(await (await fetch(`static/samples/${name}`)).blob(), name);
+    if (name) onPhoto(fetchSample(name), name);
   });
 
   listenToCamera((photo) => onPhoto(photo, "camera.jpg"));
+}
+
+async function fetchSample(name) {
+  const response = await fetch(`static/samples/${name}`);
+  if (!response.ok) throw new Refusal(response.status, null);
+  return response.blob();
 }
 
 function listenToCamera(onPhoto) {
@@ -57,6 +65,7 @@ function listenToCamera(onPhoto) {
   let stream = null;
   let facing = "user";
   let countdown = 0;
+  let openings = 0;
 
   $("shoot").addEventListener("click", () => {
     // Without HTTPS (localhost aside) pages get no camera, but phones still open theirs for a file.
@@ -75,21 +84,24 @@ function listenToCamera(onPhoto) {
 
   async function start() {
     stop();
+    const mine = openings;
     $("snap").disabled = $("timer").disabled = true;
     $("camera-notice").hidden = true;
     try {
       const wanted = { facingMode: facing, width: { ideal: 1280 }, height: { ideal: 960 } };
       const given = await navigator.mediaDevices.getUserMedia({ video: wanted });
-      if (!dialog.open) return given.getTracks().forEach((track) => track.stop());
+      if (mine !== openings) return given.getTracks().forEach((track) => track.stop());
       stream = given;
       video.srcObject = stream;
       video.classList.toggle("facing", facing === "user");
       await video.play();
       const devices = await navigator.mediaDevices.enumerateDevices();
+      if (mine !== openings) return;
       $("flip").hidden = devices.filter(({ kind }) => kind === "videoinput").length < 2;
       $("snap").disabled = $("timer").disabled = false;
       $("snap").focus();
     } catch (error) {
+      if (mine !== openings) return;
       $("camera-notice").hidden = false;
       $("camera-notice").textContent =
         error.name === "NotAllowedError"
@@ -98,7 +110,9 @@ function listenToCamera(onPhoto) {
     }
   }
 
+  /** Let go of the camera, also of one that is still being opened. */
   function stop() {
+    openings++;
     clearTimeout(countdown);
     $("timer").textContent = "in 5 seconds";
     stream?.getTracks().forEach((track) => track.stop());

@@ -1,5 +1,6 @@
 // Everything the page says about answers and refusals, in words.
 
+import { Refusal } from "./api.js";
 import { spoken } from "./figure.js";
 
 const REFUSALS = {
@@ -17,11 +18,29 @@ const REFUSALS = {
   "internal-error": ["Something broke in the server.", "Its log knows this request by the id below."],
 };
 
-/** A refusal as {headline, advice, detail, id}. */
-export function refusalInWords(refusal) {
-  const [headline, advice] = REFUSALS[refusal.slug] ?? ["The server refused.", ""];
-  const problem = refusal.problem;
-  return { headline, advice, detail: problem?.detail ?? `status ${refusal.status}`, id: problem?.request_id };
+/**
+ * Why there is no answer, as {headline, advice, detail, id, mayPass}; `mayPass` when the same may
+ * succeed a little later.
+ *
+ * @param {Error} error a Refusal, or what fetch throws
+ * @param {boolean} canBeRead whether the photo's file can
+ */
+export function failureInWords(error, canBeRead) {
+  if (!(error instanceof Refusal)) {
+    const [headline, advice] = canBeRead
+      ? ["The server cannot be reached.", "Is it still running?"]
+      : ["The photo’s file cannot be read.", "It may have been moved or changed: choose it again."];
+    return { headline, advice, detail: error.message, mayPass: canBeRead };
+  }
+  const [headline, advice] = REFUSALS[error.slug] ?? ["The server refused.", ""];
+  const problem = error.problem;
+  return {
+    headline,
+    advice,
+    detail: problem?.detail ?? `status ${error.status}`,
+    id: problem?.request_id,
+    mayPass: [408, 429].includes(error.status) || error.status >= 500,
+  };
 }
 
 const WARNINGS = {
