@@ -4,8 +4,9 @@
 
 ``--data`` has ``photos_scenes.tar``, ``photos_*.tar`` and ``lspet_val.tar``; ``--labels`` is what
 ``models.training.label_scenes`` wrote of the scenes. All of it was held out from training: one
-scene in eight, mosaics of held-out people (exact boxes), patches of held-out scenes with nobody.
-"Answered" are the people left after the pose network's second thoughts (models/presence.py).
+scene in eight, mosaics of held-out people (exact boxes), their crops as they are, patches of
+held-out scenes with nobody. "Answered" are the people left after the pose network's second thoughts
+(models/presence.py), or, where nobody is left, of the look for people who fill the photo.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from evaluation.progress import followed
 from models import PersonBox, PersonDetector, PoseEstimator
 from models.person_detector import Floats, corners, iou
 from models.presence import present
-from models.training.dataset import Image, decode_members, load
+from models.training.dataset import Image, LabelledCrop, decode_members, load
 from models.training.scenes import DEV_ONE_IN, mosaic
 
 SURE = 0.7
@@ -122,6 +123,12 @@ def empty_patches(scenes: list[Scene], rng: np.random.Generator) -> list[Image]:
     return [patches[i] for i in order]
 
 
+def around(crop: LabelledCrop) -> Floats:
+    """The box (1, 4) around a person's labelled joints."""
+    known = crop.joints_px[crop.weight > 0].astype(np.float64)
+    return np.concatenate([known.min(0), known.max(0)])[None]
+
+
 def finders() -> dict[str, Find]:
     """The person network alone, and what the service would answer, with the networks it chooses."""
     settings = load_settings()
@@ -130,9 +137,12 @@ def finders() -> dict[str, Find]:
     detector = PersonDetector(people, weights_dir=where, provider=provider)
     estimator = PoseEstimator(pose, weights_dir=where, provider=provider)
 
-    def answered(image: Image) -> list[PersonBox]:
-        boxes = detector.detect(image, MOST_PEOPLE)
+    def shown(image: Image, boxes: list[PersonBox]) -> list[PersonBox]:
         return [boxes[i] for i in present(boxes, estimator.estimate(image, boxes))]
+
+    def answered(image: Image) -> list[PersonBox]:
+        people = shown(image, detector.detect(image, MOST_PEOPLE))
+        return people or shown(image, detector.detect_close(image, MOST_PEOPLE))
 
     return {"boxes": lambda image: detector.detect(image, MOST_PEOPLE), "answered": answered}
 
@@ -156,9 +166,11 @@ def main() -> None:
         if len(boxes):
             mosaics.append(Scene(made.image, tall(boxes), boxes))
     nobody = np.empty((0, 4))
+    close = [Scene(crop.image, around(crop), around(crop)) for crop in people]
     sets = {
         "held-out scenes, teacher's boxes": scenes,
         "mosaics, exact boxes": mosaics,
+        "crops that one person fills, labelled joints' boxes": close,
         "patches without people": [Scene(p, nobody, nobody) for p in empty[:EMPTY]],
     }
     print(

@@ -39,8 +39,8 @@ class Look:
 
 
 FURTHER = (
-    Look(mirrored=True, zoom=1.0, below=0.55, share=0.67),
-    Look(mirrored=False, zoom=0.5**0.5, below=0.3, share=0.19),
+    Look(mirrored=True, zoom=1.0, below=0.52, share=0.58),
+    Look(mirrored=False, zoom=0.5**0.5, below=0.25, share=0.12),
 )
 """Who is spared a look would gain nothing by it that could be measured. The third sees the corners
 of a turned crop too."""

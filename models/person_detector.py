@@ -1,4 +1,7 @@
-"""Finding the people in a photo: one pass of the person network over the whole, shrunk photo."""
+"""Finding the people in a photo: one pass of the person network over the whole, shrunk photo.
+
+Where nobody is found, a second pass from further away may find somebody who fills the photo.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +23,10 @@ GRID_PX = 32
 """Sides of the network's input are multiples of this: the pyramid halves five times."""
 MAX_OVERLAP = 0.5
 """Two boxes that overlap more (IoU) are one person."""
+
+CLOSE_MARGIN, CLOSE_SHARE = 0.17, 0.5
+"""The second pass' margin around the photo, of the canvas; the least share of the photo's width or
+height that a box must span to count in it."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +83,16 @@ def decode(
 
 
 def shrunk(
-    image: NDArray[np.uint8], long_side_px: int
-) -> tuple[NDArray[np.uint8], tuple[int, int]]:
-    """The network's view of a photo: shrunk, in the corner of a canvas; the photo's size there."""
+    image: NDArray[np.uint8], long_side_px: int, margin: float = 0.0
+) -> tuple[NDArray[np.uint8], tuple[int, int], int]:
+    """The network's view of a photo: shrunk, on a black canvas ``long_side_px`` long.
+
+    Returns the canvas, the photo's (width, height) there, and the pixels left free above it and
+    beside it: ``margin`` of the long side.
+    """
     height, width = image.shape[:2]
-    scale = long_side_px / max(height, width)
+    free = int(margin * long_side_px)
+    scale = (long_side_px - 2 * free) / max(height, width)
     small_w, small_h = max(1, round(width * scale)), max(1, round(height * scale))
     # Halving is ten times as fast as other averages over areas; what is left to shrink, less than
     # by half, needs none. An odd last row or column is dropped: less than a pixel of the canvas.
@@ -88,10 +100,10 @@ def shrunk(
         height, width = height // 2, width // 2
         even = image[: 2 * height, : 2 * width]
         image = np.asarray(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA))
-    rows, columns = (-(-side // GRID_PX) * GRID_PX for side in (small_h, small_w))
+    rows, columns = (-(-(side + 2 * free) // GRID_PX) * GRID_PX for side in (small_h, small_w))
     canvas = np.zeros((rows, columns, 3), np.uint8)
-    canvas[:small_h, :small_w] = cv2.resize(image, (small_w, small_h))
-    return canvas, (small_w, small_h)
+    canvas[free : free + small_h, free : free + small_w] = cv2.resize(image, (small_w, small_h))
+    return canvas, (small_w, small_h), free
 
 
 class PersonDetector:
@@ -140,13 +152,31 @@ class PersonDetector:
 
         ``threshold`` is the least score, the card's by default.
         """
+        return self._found(image, 0.0, threshold)[:max_people]
+
+    def detect_close(self, image: NDArray[np.uint8], max_people: int) -> list[PersonBox]:
+        """The same, only people who fill at least half of the photo's width or height.
+
+        For photos in which :meth:`detect` leads to nobody: those who fill the canvas from one edge
+        to the other are found from further away, with black around the photo.
+        """
         height, width = image.shape[:2]
-        canvas, (small_w, small_h) = shrunk(image, self._output.long_side_px)
+        return [
+            box
+            for box in self._found(image, CLOSE_MARGIN, None)
+            if max(box.width_px / width, box.height_px / height) >= CLOSE_SHARE
+        ][:max_people]
+
+    def _found(
+        self, image: NDArray[np.uint8], margin: float, threshold: float | None
+    ) -> list[PersonBox]:
+        height, width = image.shape[:2]
+        canvas, (small_w, small_h), free = shrunk(image, self._output.long_side_px, margin)
         maps = self._model.run(canvas[None])[0]
         least = self._output.threshold if threshold is None else threshold
         boxes, scores = decode(maps, self._output.stride_px, self._output.unit_px, least)
         ratio = np.array([width / small_w, height / small_h] * 2)
-        photo = (boxes + 0.5) * ratio - 0.5
+        photo = (boxes - free + 0.5) * ratio - 0.5
         limit = np.array([width, height] * 2) - 1.0
         photo = np.clip(photo, 0.0, limit)
         size = photo[:, 2:] - photo[:, :2]
@@ -160,4 +190,4 @@ class PersonDetector:
             )
             for box, wh, score in zip(photo, size, scores, strict=True)
             if wh.min() > 1
-        ][:max_people]
+        ]

@@ -24,12 +24,17 @@ class Boxes:
     """Detects a box at every multiple of 30 px; a pose is believed where ``real`` says so."""
 
     real: str
+    close: bool = False
     asked: list[int] = field(default_factory=list)
 
     def detect(self, image: NDArray[np.uint8], max_people: int) -> list[PersonBox]:
         del image
         many = min(max_people, len(self.real))
         return [PersonBox(30.0 * i, 0, 20, 50, 0.9 - 0.01 * i) for i in range(many)]
+
+    def detect_close(self, image: NDArray[np.uint8], max_people: int) -> list[PersonBox]:
+        del image, max_people
+        return [PersonBox(0.0, 0, 390, 50, 0.8)] if self.close else []
 
     def estimate(self, image: NDArray[np.uint8], boxes: Sequence[PersonBox]) -> list[Joints2D]:
         del image
@@ -39,12 +44,15 @@ class Boxes:
             Joints2D(
                 positions_px=shape + np.array([box.x_px, 0]),
                 covariance_px2=np.tile(np.eye(2), (14, 1, 1)),
-                confidence=np.full(14, 0.9 if self.real[round(box.x_px / 30)] == "x" else 0.05),
+                confidence=np.full(14, 0.9 if self._is_real(box) else 0.05),
                 sigma_px=None,
                 peak=np.full(14, 0.9),
             )
             for box in boxes
         ]
+
+    def _is_real(self, box: PersonBox) -> bool:
+        return box.width_px > 300 or self.real[round(box.x_px / 30)] == "x"
 
     def lift(self, observations: Sequence[object], *_: Any, **__: Any) -> list[NotLiftable]:
         return [NotLiftable("too few joints")] * len(observations)
@@ -69,4 +77,19 @@ def test_a_box_that_shows_nobody_leaves_its_place_to_the_next(
     pipeline = Pipeline(boxes, boxes, lifter, max_pixels=10**6, decode_side_px=448)
     result = pipeline.estimate(PHOTO, PhotoQuery(max_people=max_people))
     assert [round(person.box_px[0] / 30) for person in result.people] == answered
+    assert boxes.asked == asked
+
+
+@pytest.mark.parametrize(
+    ("real", "width_px", "asked"),
+    [("-", 390, [1, 1]), ("", 390, [1]), ("-x", 20, [2])],  # nobody, no box, somebody
+)
+def test_whoever_fills_the_photo_is_looked_for_where_nobody_else_is(
+    real: str, width_px: float, asked: list[int]
+) -> None:
+    boxes = Boxes(real, close=True)
+    lifter = cast("Lifter", boxes)
+    pipeline = Pipeline(boxes, boxes, lifter, max_pixels=10**6, decode_side_px=448)
+    (person,) = pipeline.estimate(PHOTO, PhotoQuery()).people
+    assert person.box_px[2] == width_px
     assert boxes.asked == asked

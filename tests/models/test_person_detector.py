@@ -1,3 +1,4 @@
+import json
 from pathlib import Path
 
 import cv2
@@ -5,7 +6,7 @@ import numpy as np
 import pytest
 
 from models.card import DetectorOutput
-from models.person_detector import PersonDetector, decode, iou, shrunk
+from models.person_detector import PersonDetector, corners, decode, iou, shrunk
 
 PHOTO = Path(__file__).parents[1] / "data" / "renders" / "014.jpg"
 
@@ -80,10 +81,42 @@ def test_a_shrunk_photo_keeps_its_pixels_in_place(side: int) -> None:
     """In a ramp each pixel says where it was, to a pixel of the canvas, halved exactly or not."""
     ramp = np.arange(side, dtype=np.uint8)
     photo = np.stack([*np.meshgrid(ramp, ramp), np.zeros((side, side), np.uint8)], -1)
-    canvas, (width, height) = shrunk(np.asarray(photo, np.uint8), 32)
+    canvas, (width, height), _ = shrunk(np.asarray(photo, np.uint8), 32)
     assert (width, height) == (32, 32)
     meant = (np.arange(32) + 0.5) * side / 32 - 0.5
     inner = slice(1, -1)  # beyond the outermost pixels' centres there is nothing to blend with
     near = max(1.0, side / 32)
     np.testing.assert_allclose(canvas[16, inner, 0], meant[inner], atol=near)
     np.testing.assert_allclose(canvas[inner, 16, 1], meant[inner], atol=near)
+
+
+@pytest.mark.parametrize("name", ["014.jpg", "022.jpg"])
+def test_who_fills_the_photo_is_found_from_further_away_and_nobody_smaller(name: str) -> None:
+    photo = cv2.imread(str(PHOTO.parent / name))
+    assert photo is not None
+    records = json.loads((PHOTO.parent / "ground_truth.json").read_text())["images"]
+    (truth,) = (np.array(r["joints_2d_px"]) for r in records if r["file"] == name)
+    low, high = (corner.astype(int) for corner in (truth.min(0) - 5, truth.max(0) + 5))
+    tight = np.ascontiguousarray(photo[low[1] : high[1], low[0] : high[0]])
+    detector = PersonDetector(provider="cpu")
+    found = detector.detect_close(np.asarray(tight, np.uint8), 1)
+    box = corners(found)
+    wanted = np.concatenate([truth.min(0) - low, truth.max(0) - low])[None]
+    assert iou(box, wanted)[0, 0] > 0.5
+    assert (box >= 0).all()
+    assert (box[:, 2:] <= np.array(tight.shape[1::-1])).all()
+    far = np.pad(tight, [(2 * len(tight),) * 2, (2 * len(tight),) * 2, (0, 0)])
+    assert detector.detect_close(np.asarray(far, np.uint8), 1) == []
+
+
+@pytest.mark.parametrize(("height", "width"), [(60, 90), (91, 33), (448, 448), (7, 300)])
+def test_a_margin_leaves_the_canvas_as_large_and_the_photo_in_its_middle(
+    height: int, width: int
+) -> None:
+    photo = np.full((height, width, 3), 200, np.uint8)
+    canvas, (small_w, small_h), free = shrunk(photo, 448, 0.17)
+    inside = canvas[free : free + small_h, free : free + small_w]
+    assert max(canvas.shape[:2]) == 448
+    assert max(small_w, small_h) == 448 - 2 * free
+    assert (inside == 200).all()
+    assert (canvas > 0).sum() == inside.size
