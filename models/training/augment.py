@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from library_store.skeleton import LSP14
 from models.crop import warped
 from models.training.cutout import over, place, silhouette, whole
-from models.training.dataset import TORSO, Image, LabelledCrop, SideDoubt
+from models.training.dataset import TORSO, Image, LabelledCrop
 
 MIRROR = np.array(LSP14.mirror)
 CROP_SCALE = 1.25
@@ -30,14 +30,13 @@ class Sample:
 
     ``image`` (size, size, 3) uint8 BGR; ``joints_px`` (14, 2) float32 in its pixels; ``weight``
     (14,) trust in the position, 0 outside the crop; ``presence`` (14,) 1 seen, 0 known to be
-    outside the crop, -1 unknown; ``side_doubt`` as in ``LabelledCrop``.
+    outside the crop, -1 unknown.
     """
 
     image: Image
     joints_px: NDArray[np.float32]
     weight: NDArray[np.float32]
     presence: NDArray[np.float32]
-    side_doubt: SideDoubt
 
 
 def crop_matrix(
@@ -85,7 +84,6 @@ def _warp(
         joints.astype(np.float32),
         np.where(inside, weight, 0).astype(np.float32),
         presence.astype(np.float32),
-        crop.side_doubt,
     )
 
 
@@ -112,7 +110,7 @@ def random_view(
     if rng.random() < 0.35:
         for _ in range(rng.integers(1, 3)):
             _occlude(image, sample.joints_px, presence, other.image, rng)
-    return replace(sample, image=expose(image, rng), presence=presence)
+    return Sample(expose(image, rng), sample.joints_px, sample.weight, presence)
 
 
 def in_company(crop: LabelledCrop, other: LabelledCrop, rng: np.random.Generator) -> LabelledCrop:

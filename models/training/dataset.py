@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import tarfile
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,9 +43,6 @@ DEV_LABELLED = 200
 """Labelled crops of each training file kept aside to choose by; lspet_val is only reported."""
 DEV_RENDERED = 100
 
-SideDoubt = tuple[float, float]
-"""How probably the labels of the upper and of the lower half have right and left exchanged."""
-
 
 @dataclass(frozen=True)
 class LabelledCrop:
@@ -53,8 +50,7 @@ class LabelledCrop:
 
     ``image`` (h, w, 3) uint8 BGR; ``joints_px`` (14, 2) float32; ``weight`` (14,) float32, how far
     the position is trusted; ``visible`` (14,) float32, 1 where the joint is known to be seen;
-    ``wild`` marks sport poses, which may stand on their heads; ``side_doubt`` where that is
-    known of its labels.
+    ``wild`` marks sport poses, which may stand on their heads.
     """
 
     name: str
@@ -64,7 +60,6 @@ class LabelledCrop:
     weight: NDArray[np.float32]
     visible: NDArray[np.float32]
     wild: bool
-    side_doubt: SideDoubt = (0.0, 0.0)
 
     @property
     def extent_px(self) -> tuple[NDArray[np.float32], float]:
@@ -227,23 +222,6 @@ def load(path: Path) -> list[LabelledCrop]:
     return crops
 
 
-def sides_file(path: Path) -> Path:
-    """Where a dataset's side doubts lie, a JSON object: image's name -> ``SideDoubt``."""
-    return path.with_name(path.name.removesuffix(".tar") + ".sides.json")
-
-
-def _doubted(path: Path, crops: list[LabelledCrop]) -> list[LabelledCrop]:
-    """The crops of a dataset with what ``side_doubts`` wrote about them, if it did."""
-    file = sides_file(path)
-    if not file.exists():
-        return crops
-    doubts: dict[str, list[float]] = json.loads(file.read_text())
-    missing = [crop.name for crop in crops if crop.name not in doubts]
-    if missing:
-        raise AnnotationError(f"{file} says nothing about {missing[0]}: make it again")
-    return [replace(c, side_doubt=(doubts[c.name][0], doubts[c.name][1])) for c in crops]
-
-
 def in_held_out_group(group: int) -> bool:
     """Whether a photo, by its number, is held out."""
     return (group * 2654435761 % 2**32) % HOLD_OUT_ONE_IN == 0
@@ -261,14 +239,13 @@ def read_crops(
 
     Comma-separated names of tars in ``folder``, or paths, without ".tar"; ``name*2`` is drawn
     twice as often. Files called lspet* and rendered* are trained on whole but for their last crops,
-    of others one photo in ``HOLD_OUT_ONE_IN`` is held out. Side doubts beside a tar come with it.
+    of others one photo in ``HOLD_OUT_ONE_IN`` is held out.
     """
     crops: list[LabelledCrop] = []
     kept: dict[str, list[LabelledCrop]] = {"photos_dev": [], "labelled_dev": []}
     for item in train.split(","):
         name, _, times = item.partition("*")
-        path = folder / f"{name}.tar"
-        loaded = _doubted(path, load(path))
+        loaded = load(folder / f"{name}.tar")
         kind = Path(name).name
         if kind.startswith("lspet"):
             kept["labelled_dev"] += loaded[-DEV_LABELLED:]

@@ -22,11 +22,8 @@ from models.training.objective import total_loss
 from models.training.precision import mixed_precision
 
 
-def to_batch(samples: list[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Samples -> image (B,3,S,S) in [-1,1], and the labels as total_loss takes them.
-
-    Joints (B,14,2), weight (B,14), presence (B,14), side_doubt (B,2).
-    """
+def to_batch(samples: list[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Samples -> (image (B,3,S,S) in [-1,1], joints (B,14,2), weight (B,14), presence (B,14))."""
     images = torch.from_numpy(np.stack([s.image for s in samples]))
     x = images.permute(0, 3, 1, 2).float().mul_(1 / 127.5).sub_(1)
     return (
@@ -34,7 +31,6 @@ def to_batch(samples: list[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor, Ten
         torch.from_numpy(np.stack([s.joints_px for s in samples])),
         torch.from_numpy(np.stack([s.weight for s in samples])),
         torch.from_numpy(np.stack([s.presence for s in samples])),
-        torch.tensor([s.side_doubt for s in samples]),
     )
 
 
@@ -63,7 +59,7 @@ def measure(
     predicted, truth, known = [], [], []
     for start in range(0, len(crops), 64):
         samples = [canonical(c, size) for c in crops[start : start + 64]]
-        x, joints, weight, *_ = to_batch(samples)
+        x, joints, weight, _ = to_batch(samples)
         with torch.no_grad(), mixed_precision(device):
             logits = model(x.to(device))[-1]
         predicted.append(peaks_px(logits, model.cfg.n_joints, size))
@@ -105,10 +101,10 @@ def main() -> None:
         return to_batch([random_view(crops[i], crops[j], size, rng) for i, j in picked])
 
     def loss_of(model: ConvolutionalPoseMachine, batch: loop.Batch) -> Tensor:
-        x, joints, weight, presence, side_doubt = batch
+        x, joints, weight, presence = batch
         with mixed_precision(args.device):
             stages = model(x)
-        return total_loss(stages, joints, weight, presence, side_doubt, x.shape[-1])
+        return total_loss(stages, joints, weight, presence, x.shape[-1])
 
     def evaluate(model: ConvolutionalPoseMachine, size: int) -> dict[str, float]:
         return {f"pck_0.2/{k}": measure(model, v, size, args.device) for k, v in kept.items()}
