@@ -179,6 +179,50 @@ def _occlude(
     presence[under & (presence > 0)] = -1  # still inferable, but not to be called seen
 
 
+def worsen(image: Image, rng: np.random.Generator) -> Image:
+    """One of heavy noise, blur, camera shake, glare, darkness and coarse JPEG.
+
+    Rougher than ``expose``: what phones bring home from dim rooms, against the light and through
+    messengers. For people who are to be found there, not for where exactly their joints lie.
+    """
+    kind = rng.integers(6)
+    if kind == 0:
+        noise = rng.normal(0, rng.uniform(10, 32), image.shape)
+        return np.clip(image + noise, 0, 255).astype(np.uint8)
+    if kind == 1:
+        blurred: Image = cv2.GaussianBlur(image, (0, 0), rng.uniform(1.2, 4.0))
+        return blurred
+    if kind == 2:
+        return shaken(image, rng.uniform(4, 16), rng.uniform(0, np.pi))
+    if kind == 3:
+        return np.clip(image * rng.uniform(1.4, 2.3), 0, 255).astype(np.uint8)
+    if kind == 4:
+        return (image * rng.uniform(0.12, 0.5)).astype(np.uint8)
+    return _as_jpeg(image, int(rng.integers(5, 20)))
+
+
+def shaken(image: Image, length_px: float, angle_rad: float) -> Image:
+    """Smeared along a straight line of ``length_px`` through every pixel, which stays where it is.
+
+    The angle is of the image's x axis towards its y axis.
+    """
+    reach = int(np.ceil(length_px / 2))
+    middle = np.array([reach, reach])
+    half = 0.5 * length_px * np.array([np.cos(angle_rad), np.sin(angle_rad)])
+    start, end = (np.rint((middle + way * half) * 16).astype(int) for way in (-1, 1))
+    kernel = np.zeros((2 * reach + 1, 2 * reach + 1), np.float32)
+    cv2.line(kernel, start.tolist(), end.tolist(), 1.0, 1, cv2.LINE_8, 4)
+    smeared: Image = cv2.filter2D(image, -1, kernel / kernel.sum())
+    return smeared
+
+
+def _as_jpeg(image: Image, quality: int) -> Image:
+    """What is left of an image after JPEG of that quality (0 to 100)."""
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    return image if decoded is None else decoded
+
+
 def expose(image: Image, rng: np.random.Generator) -> Image:
     """Exposure, white balance, grey, blur, low resolution, noise and JPEG."""
     ramp = np.linspace(0, 1, 256, dtype=np.float32)
@@ -203,7 +247,5 @@ def expose(image: Image, rng: np.random.Generator) -> Image:
         noise = rng.normal(0, rng.uniform(3, 14), image.shape)
         image = np.clip(image + noise, 0, 255).astype(np.uint8)
     if dice[4] < 0.07:
-        _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(25, 75))])
-        decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
-        return image if decoded is None else decoded
+        return _as_jpeg(image, int(rng.integers(25, 75)))
     return image

@@ -110,17 +110,33 @@ def scene_view(
     return SceneSample(expose(image, rng), boxes[inside & (score >= SURE)], trust)
 
 
+def turned(sample: SceneSample, quarters: int) -> SceneSample:
+    """The sample turned clockwise by so many quarters; odd ones exchange width and height."""
+    image, boxes, trust = sample.image, sample.boxes, sample.trust
+    for _ in range(quarters % 4):
+        x0, y0, x1, y1 = boxes.T
+        bottom = image.shape[0] - 1
+        boxes = np.stack([bottom - y1, x0, bottom - y0, x1], 1)
+        image, trust = np.rot90(image, -1), np.rot90(trust, -1)
+    return SceneSample(np.ascontiguousarray(image), boxes, np.ascontiguousarray(trust))
+
+
 def portrait(crop: LabelledCrop, size: tuple[int, int], rng: np.random.Generator) -> SceneSample:
-    """One crop over the whole canvas, its own background carried on: a photo of one person."""
+    """One crop over the whole canvas: a photo of one person.
+
+    Beyond the crop its background is carried on, or it is black: as in a detector's second pass
+    over a photo that somebody fills, ``PersonDetector.detect_close``.
+    """
     box = box_of(crop)
     cover = max(size) / max(crop.image.shape[:2])
-    scale = cover * float(np.exp(rng.uniform(np.log(0.75), np.log(1.4))))
+    scale = cover * float(np.exp(rng.uniform(np.log(0.6), np.log(1.4))))
     flip = bool(rng.random() < 0.5)
     mid = (box[0, :2] + box[0, 2:]) / 2 * scale
     at = np.array(size) * rng.uniform(0.35, 0.65, 2)
     matrix = np.array([[-scale if flip else scale, 0, 0], [0, scale, 0]])
     matrix[:, 2] = at - mid * (-1 if flip else 1, 1)
-    image = cv2.warpAffine(crop.image, matrix, size, borderMode=cv2.BORDER_REPLICATE)
+    beyond = cv2.BORDER_CONSTANT if rng.random() < 0.4 else cv2.BORDER_REPLICATE
+    image = cv2.warpAffine(crop.image, matrix, size, borderMode=beyond)
     boxes, inside = still_inside(moved(box, matrix.astype(np.float32)), size)
     trust = np.full((size[1] // 8, size[0] // 8), 0.4, np.float32)
     for b in boxes:

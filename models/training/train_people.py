@@ -6,6 +6,7 @@ Learns from mosaics of the labelled crops and from scenes that label_scenes.py h
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from torch.nn import functional as F
 from models.crop import warped
 from models.person_detector import decode, iou
 from models.training import loop
+from models.training.augment import worsen
 from models.training.crowds import calm_patches, crowd
 from models.training.cutout import whole
 from models.training.dataset import read_crops
@@ -29,10 +31,16 @@ from models.training.scenes import (
     portrait,
     read_scenes,
     scene_view,
+    turned,
 )
 
 UNIT_PX = 32.0
 """Distances to the box's sides are learned as logarithms of multiples of this."""
+QUARTERS = (0.64, 0.13, 0.1, 0.13)
+"""Shares of the samples that are upright and turned by one, two and three quarters: photos without
+EXIF come on their side, and sport is done upside down."""
+ROUGH_SHARE = 0.3
+"""Of the samples that are worsened beyond what ``expose`` does to all of them."""
 
 
 def targets(
@@ -117,15 +125,20 @@ def main() -> None:
         maps = [torch.from_numpy(a) for a in targets(samples, stride)]
         return (x, *maps, torch.from_numpy(np.stack([s.trust for s in samples])))
 
-    def sample(rng: np.random.Generator) -> SceneSample:
+    def upright(rng: np.random.Generator, size: tuple[int, int]) -> SceneSample:
         dice = rng.random()
         if dice < 0.3:
-            return scene_view(train[rng.integers(len(train))], canvas, rng)
-        if dice < 0.45:
-            return portrait(crops[rng.integers(len(crops))], canvas, rng)
+            return scene_view(train[rng.integers(len(train))], size, rng)
+        if dice < 0.5:
+            return portrait(crops[rng.integers(len(crops))], size, rng)
         if dice < 0.75:
-            return crowd(entire, calm, train, canvas, rng)
-        return mosaic(crops, empty, canvas, rng)
+            return crowd(entire, calm, train, size, rng)
+        return mosaic(crops, empty, size, rng)
+
+    def sample(rng: np.random.Generator) -> SceneSample:
+        quarters = int(rng.choice(4, p=QUARTERS))
+        made = turned(upright(rng, canvas[::-1] if quarters % 2 else canvas), quarters)
+        return replace(made, image=worsen(made.image, rng)) if rng.random() < ROUGH_SHARE else made
 
     def make_batch(step: int, size: int) -> loop.Batch:  # noqa: ARG001
         rng = np.random.default_rng((args.seed, step))
