@@ -62,29 +62,35 @@ class Counts:
     boxes: int
     strange: int
     duplicates: int
+    peopled: int
+    """Scenes with somebody to be found, and how many of these came back without a box."""
+    missed: int
 
     def row(self, name: str) -> str:
         """A line of the table."""
         recall = f"{100 * self.found / self.wanted:.1f}" if self.wanted else "-"
         precision = f"{100 * (1 - self.strange / self.boxes):.1f}" if self.boxes else "-"
+        missed = f"{100 * self.missed / self.peopled:.1f}" if self.peopled else "-"
         return (
-            f"| {name} | {self.scenes} | {self.wanted} | {recall} | {precision} "
+            f"| {name} | {self.scenes} | {self.wanted} | {recall} | {missed} | {precision} "
             f"| {self.duplicates} | {self.strange / self.scenes:.3f} |"
         )
 
 
 def count(find: Find, scenes: list[Scene], label: str) -> Counts:
     """Run ``find`` over scenes. A duplicate is a further box of somebody found already."""
-    found = wanted = total = strange = duplicates = 0
+    found = wanted = total = strange = duplicates = peopled = missed = 0
     for scene in followed(scenes, label):
         boxes = corners(find(scene.image))
         overlap = iou(boxes, scene.wanted)
         found += int((overlap.max(0, initial=0) > SAME).sum())
         wanted += len(scene.wanted)
+        peopled += bool(len(scene.wanted))
+        missed += bool(len(scene.wanted)) and not len(boxes)
         total += len(boxes)
         strange += int((iou(boxes, scene.known).max(1, initial=0) < STRANGE).sum())
         duplicates += int(np.clip((overlap > SAME).sum(0) - 1, 0, None).sum())
-    return Counts(len(scenes), wanted, found, total, strange, duplicates)
+    return Counts(len(scenes), wanted, found, total, strange, duplicates, peopled, missed)
 
 
 def tall(boxes: Floats) -> Floats:
@@ -129,6 +135,11 @@ def around(crop: LabelledCrop) -> Floats:
     return np.concatenate([known.min(0), known.max(0)])[None]
 
 
+def filled(crop: LabelledCrop) -> Scene:
+    """A crop as a photo of its own."""
+    return Scene(crop.image, around(crop), around(crop))
+
+
 def finders() -> dict[str, Find]:
     """The person network alone, and what the service would answer, with the networks it chooses."""
     settings = load_settings()
@@ -158,7 +169,8 @@ def main() -> None:
     rng = np.random.default_rng(args.seed)
     scenes = teacher_scenes(decode_members(args.data / "photos_scenes.tar"), args.labels)
     empty = empty_patches(scenes, rng)
-    people = load(args.data / "lspet_val.tar") + held_out_photos(args.data)
+    sport, everyday = load(args.data / "lspet_val.tar"), held_out_photos(args.data)
+    people = sport + everyday
     mosaics: list[Scene] = []
     while len(mosaics) < MOSAICS:
         made = mosaic(people, empty, MOSAIC_SIZE, rng)
@@ -166,17 +178,18 @@ def main() -> None:
         if len(boxes):
             mosaics.append(Scene(made.image, tall(boxes), boxes))
     nobody = np.empty((0, 4))
-    close = [Scene(crop.image, around(crop), around(crop)) for crop in people]
     sets = {
         "held-out scenes, teacher's boxes": scenes,
         "mosaics, exact boxes": mosaics,
-        "crops that one person fills, labelled joints' boxes": close,
+        "lspet_val's crops, which one person fills": [filled(crop) for crop in sport],
+        "photos' crops, which one person fills": [filled(crop) for crop in everyday],
         "patches without people": [Scene(p, nobody, nobody) for p in empty[:EMPTY]],
     }
     print(
-        "| set: of what | scenes | people | recall, % | precision, % | duplicates | strange/scene |"
+        "| set: of what | scenes | people | recall, % | nobody, % | precision, % | duplicates "
+        "| strange/scene |"
     )
-    print("|---|---|---|---|---|---|---|")
+    print("|---|---|---|---|---|---|---|---|")
     for title, chosen in sets.items():
         for who, find in finders().items():
             print(count(find, chosen, title).row(f"{title}: {who}"), flush=True)

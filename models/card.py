@@ -169,9 +169,36 @@ def read_card(path: Path) -> ModelCard:
 
 
 def write_card(path: Path, card: ModelCard) -> None:
-    """Write a card as people read it, checked once more."""
-    text = ModelCard.model_validate(card.model_dump()).model_dump_json(indent=2) + "\n"
-    path.write_text(text, encoding="utf-8")
+    """Write a card as people read it, checked once more; the old one stays until it is whole."""
+    _write([(path, _text(card))])
+
+
+def write_network(directory: Path, data: bytes, card: ModelCard) -> ModelCard:
+    """Write the weights' bytes and their card; returns the card with their sha256.
+
+    Both are written whole beside the files they replace: a disk that is full leaves the old pair.
+    """
+    card = card.model_copy(update={"sha256": hashlib.sha256(data).hexdigest()})
+    directory.mkdir(parents=True, exist_ok=True)
+    _write([(directory / card.file, data), (directory / f"{card.name}.json", _text(card))])
+    return card
+
+
+def _text(card: ModelCard) -> bytes:
+    checked = ModelCard.model_validate(card.model_dump())
+    return (checked.model_dump_json(indent=2) + "\n").encode()
+
+
+def _write(files: list[tuple[Path, bytes]]) -> None:
+    parts = [path.with_name(f"{path.name}.part") for path, _ in files]
+    try:
+        for part, (_, data) in zip(parts, files, strict=True):
+            part.write_bytes(data)
+        for part, (path, _) in zip(parts, files, strict=True):
+            part.replace(path)
+    finally:
+        for part in parts:
+            part.unlink(missing_ok=True)
 
 
 def read_weights(path: Path, card: ModelCard) -> bytes:

@@ -7,7 +7,6 @@ in half precision (and run in single): half the download, no measurable loss.
 from __future__ import annotations
 
 import argparse
-import hashlib
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -18,7 +17,7 @@ from onnx import numpy_helper
 from torch import Tensor, nn
 
 from library_store.skeleton import LSP14
-from models.card import WEIGHTS_DIR, DetectorOutput, ModelCard, PoseOutput, write_card
+from models.card import WEIGHTS_DIR, DetectorOutput, ModelCard, PoseOutput, write_network
 from models.errors import ModelError
 from models.training.augment import CROP_SCALE
 from models.training.loop import read_checkpoint
@@ -161,12 +160,7 @@ def person_card(network: PersonNetwork, name: str, version: str, size: int) -> M
 
 def publish(model: onnx.ModelProto, card: ModelCard, directory: Path) -> ModelCard:
     """Write the ONNX file and its card; returns the card with the file's sha256."""
-    data = model.SerializeToString(deterministic=True)
-    card = card.model_copy(update={"sha256": hashlib.sha256(data).hexdigest()})
-    directory.mkdir(parents=True, exist_ok=True)
-    (directory / card.file).write_bytes(data)
-    write_card(directory / f"{card.name}.json", card)
-    return card
+    return write_network(directory, model.SerializeToString(deterministic=True), card)
 
 
 def export(
