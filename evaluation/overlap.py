@@ -4,14 +4,16 @@
 
 Held-out people of ``lspet_val.tar`` and ``photos_*.tar``, two at a time: one is cut out along the
 limbs and set before another, of about the same size, so that their boxes overlap. Every network of
-``evaluation.pose2d`` gets each of the two by the true square. A limb joint that can be seen counts
-as *exchanged* when it is put within a fifth of the torso of the other one's joint of that kind,
-left or right, and is further than that from the own one.
+``evaluation.pose2d`` gets each of the two by the true square; ours both at once, as in the service
+(models/rivals.py), and each alone. A limb joint that can be seen counts as *exchanged* when it is
+put within a fifth of the torso of the other one's joint of that kind, left or right, and is further
+than that from the own one.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,7 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evaluation.metrics import Floats
-from evaluation.pose2d import Estimate, held_out_photos, networks
+from evaluation.pose2d import (
+    Estimate,
+    held_out_photos,
+    networks,
+    pose_estimator,
+    true_square,
+)
 from evaluation.progress import followed
 from library_store.skeleton import LIMB_JOINTS, LSP14
 from models.pck import correct_keypoints, torso_px
@@ -84,12 +92,32 @@ class Score:
     exchanged: float
 
 
-def score(estimate: Estimate, pairs: list[Pair], label: str) -> Score:
+EstimateBoth = Callable[[Pair], list[Floats]]
+
+
+def alone(estimate: Estimate) -> EstimateBoth:
+    """A network that looks at each of the two as if there were nobody else."""
+    return lambda two: [estimate(person) for person in two.people]
+
+
+def together(name: str, weights: Path | None) -> EstimateBoth:
+    """Our network as the service runs it: all people of a photo at once."""
+    estimator = pose_estimator(name, weights)
+
+    def estimate(two: Pair) -> list[Floats]:
+        boxes = [true_square(person) for person in two.people]
+        return [found.positions_px for found in estimator.estimate(two.people[0].image, boxes)]
+
+    return estimate
+
+
+def score(estimate: EstimateBoth, pairs: list[Pair], label: str) -> Score:
     """Run a network over both people of each pair."""
-    found, truth, other, seen = [], [], [], []
+    found: list[Floats] = []
+    truth, other, seen = [], [], []
     for two in followed(pairs, label):
+        found += estimate(two)
         for i, person in enumerate(two.people):
-            found.append(estimate(person))
             truth.append(person.joints_px)
             other.append(two.people[1 - i].joints_px)
             seen.append(two.seen[i] & (person.weight >= LEAST_WEIGHT))
@@ -138,8 +166,11 @@ def main() -> None:
     print("| set | network | right, % | exchanged, % |\n|---|---|---|---|")
     for title, crops in sets.items():
         pairs = pairs_of(crops, args.pairs, rng)
+        every = {"ours": together(args.name, args.weights)}
         for name, estimate in networks(args.name, args.weights, args.reference).items():
-            result = score(estimate, pairs, f"{title}: {name}")
+            every["ours, each alone" if name == "ours" else name] = alone(estimate)
+        for name, estimate_both in every.items():
+            result = score(estimate_both, pairs, f"{title}: {name}")
             print(f"| {title} | {name} | {result.right:.1f} | {result.exchanged:.1f} |", flush=True)
 
 

@@ -1,6 +1,6 @@
 """2D joints: our pose network beside networks that users would pick instead, on the same crops.
 
-    python -m evaluation.pose2d --data DIR --reference DIR [--name cpm]
+    python -m evaluation.pose2d --data DIR --reference DIR [--name cpm-int8]
 
 ``--data`` has ``lspet_val.tar`` (human labels) and ``photos_*.tar`` (labels by the heavy reference;
 only the photos that training held out are used); ``--reference`` the networks to compare with, in
@@ -77,15 +77,24 @@ class Score:
         return 100 * float(self.swapped[who].sum() / self.pairs[who].sum())
 
 
+def pose_estimator(name: str, weights: Path | None) -> PoseEstimator:
+    """Our network of that name, from where it ships unless told otherwise."""
+    return PoseEstimator(name, weights_dir=weights) if weights else PoseEstimator(name)
+
+
+def true_square(crop: LabelledCrop) -> PersonBox:
+    """The square about the labelled joints."""
+    center, extent = crop.extent_px
+    x, y = (float(v) for v in center - extent / 2)
+    return PersonBox(x_px=x, y_px=y, width_px=extent, height_px=extent, score=1.0)
+
+
 def ours(name: str, weights: Path | None) -> Estimate:
     """Our network through its shipped path."""
-    estimator = PoseEstimator(name, weights_dir=weights) if weights else PoseEstimator(name)
+    estimator = pose_estimator(name, weights)
 
     def estimate(crop: LabelledCrop) -> Floats:
-        center, extent = crop.extent_px
-        x, y = (float(v) for v in center - extent / 2)
-        box = PersonBox(x_px=x, y_px=y, width_px=extent, height_px=extent, score=1.0)
-        return estimator.estimate(crop.image, [box])[0].positions_px
+        return estimator.estimate(crop.image, [true_square(crop)])[0].positions_px
 
     return estimate
 
@@ -222,7 +231,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--reference", type=Path, required=True)
     parser.add_argument("--weights", type=Path)
-    parser.add_argument("--name", default="cpm")
+    parser.add_argument("--name", default="cpm-int8")
     parser.add_argument(
         "--photos", type=int, default=100_000, help="at most so many held-out photos"
     )

@@ -6,6 +6,7 @@ nothing of the network that made them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
@@ -194,18 +195,32 @@ class Reading:
 
 
 def read_maps(
-    maps: NDArray[np.float32], n_joints: int, kind: str, target_sigma_cells: float
+    maps: NDArray[np.float32],
+    n_joints: int,
+    kind: str,
+    target_sigma_cells: float,
+    own: Callable[[Maps, Floats], Maps] | None = None,
 ) -> Reading:
-    """Read a network's (N, n_joints + 1, h, w) maps, the last one being the background's."""
+    """Read a network's (N, n_joints + 1, h, w) maps, the last one being the background's.
+
+    ``own`` says of marginals and of the beliefs at their strongest cells (N, J) what share of each
+    place is the person's own (N, J, h, w); see models/rivals.py.
+    """
     joint_maps = maps[:, :n_joints]
     background = maps[:, n_joints].astype(np.float64)
     if kind == "logits":
         background = 1 / (1 + np.exp(-np.clip(background, -30, 30)))
     p = marginals(joint_maps, kind)
+    if own is not None:
+        strongest = p.reshape(*p.shape[:2], -1).argmax(-1)
+        p = p * own(p, peak_beliefs(joint_maps, strongest, kind))
     at, best = sub_cell_peaks(pooled(p))
+    left = p
+    if own is not None:  # what is lost to others counts against the joint, not for its place
+        left = p / np.maximum(p.sum((-1, -2), keepdims=True), np.float32(1e-12))
     if kind == "beliefs":
-        p = without_residue(p)
-    covariance = spread(p, at, target_sigma_cells)
+        left = p = without_residue(left)
+    covariance = spread(left, at, target_sigma_cells)
     peak = peak_beliefs(joint_maps, best, kind)
     return Reading(at, covariance, peak, confidence_features(peak, covariance, p, best, background))
 

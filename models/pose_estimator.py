@@ -12,10 +12,11 @@ from library_store.skeleton import LSP14
 from models.card import WEIGHTS_DIR, ModelCard, PoseOutput
 from models.crop import square_crop
 from models.errors import ModelError
-from models.heatmaps import Floats, Joints2D, calibrated, read_maps
+from models.heatmaps import Floats, Joints2D, Maps, calibrated, read_maps
 from models.looks import looked_at
 from models.person_detector import PersonBox
 from models.providers import ProviderChoice, Runtime
+from models.rivals import shares
 from models.session import OnnxModel
 
 
@@ -79,13 +80,21 @@ class PoseEstimator:
         scales: Sequence[float],
         origins: Sequence[tuple[float, float]],
     ) -> list[Joints2D]:
-        """Joints from the network's (N, 15, h, w) maps; photo = origin + scale * crop pixel."""
+        """Joints from the network's (N, 15, h, w) maps of people in one photo.
+
+        A crop's pixel lies in the photo at origin + scale * pixel.
+        """
         out = self._output
-        read = read_maps(maps, len(out.joint_names), out.maps, out.target_sigma_cells)
-        scale = np.asarray(scales, np.float64)
+        scale, origin_px = np.asarray(scales, np.float64), np.asarray(origins, np.float64)
+
+        def own(p: Maps, belief: Floats) -> Maps:
+            return shares(p, belief, scale, origin_px, out.stride_px)
+
+        several = own if len(maps) > 1 else None
+        read = read_maps(maps, len(out.joint_names), out.maps, out.target_sigma_cells, several)
         # The centre of cell c lies at crop pixel (c + 0.5) * stride - 0.5.
         crop_px = (read.at + 0.5) * out.stride_px - 0.5
-        positions = np.asarray(origins)[:, None] + scale[:, None, None] * crop_px
+        positions = origin_px[:, None] + scale[:, None, None] * crop_px
         covariance_px2 = read.covariance * (scale * out.stride_px)[:, None, None, None] ** 2
         confidence: Floats | None = None
         sigma: Floats | None = None

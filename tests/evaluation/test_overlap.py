@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from evaluation.overlap import Pair, pair, pairs_of, score
+from evaluation.overlap import Pair, alone, pair, pairs_of, score
 from library_store.skeleton import LSP14
 from models.training.dataset import LabelledCrop
 from tests.models.training.test_crowds import standing
@@ -44,7 +44,7 @@ def test_a_perfect_network_exchanges_nothing_and_one_that_sees_the_other_everyth
     def other(crop: LabelledCrop) -> np.ndarray:
         return partner[id(crop.image), crop.joints_px.tobytes()].astype(np.float64)
 
-    best, worst = score(perfect, pairs, "perfect"), score(other, pairs, "other")
+    best, worst = score(alone(perfect), pairs, "perfect"), score(alone(other), pairs, "other")
     assert (best.right, best.exchanged) == (100.0, 0.0)
     assert worst.exchanged > 60
     assert worst.right + worst.exchanged == 100
@@ -60,4 +60,4 @@ def test_sides_of_the_other_person_do_not_matter() -> None:
         mine = 0 if np.array_equal(two.people[0].joints_px, crop.joints_px) else 1
         return two.people[1 - mine].joints_px[mirror].astype(np.float64)
 
-    assert score(other_way_round, pairs, "mirrored").exchanged > 60
+    assert score(alone(other_way_round), pairs, "mirrored").exchanged > 60
