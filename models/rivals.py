@@ -40,37 +40,37 @@ def shares(p: Maps, belief: Floats, scale: Floats, origin_px: Floats, stride_px:
         stride_px: the crop's pixels in a cell.
 
     """
-    own = np.ones_like(p)
     n, _, h, _ = p.shape
     # A cell's place in the photo: first + step * cell, x and y.
     step = scale * stride_px
     first = origin_px + scale[:, None] * (stride_px - 1) / 2
-    pairs = [(i, k) for i in range(n) for k in range(n) if i != k and _meet(first, step, h, i, k)]
-    if not pairs:
-        return own
-    onto = {
-        (i, k): [_bilinear(h, step[i] / step[k], at) for at in (first[i] - first[k]) / step[k]]
-        for i, k in pairs
-    }
+    ends = first + h * step[:, None]
+    meet = (np.maximum(first[:, None], first) < np.minimum(ends[:, None], ends)).all(-1)
+    mine, theirs = np.nonzero(meet & ~np.eye(n, dtype=bool))
+    if not len(mine):
+        return np.ones_like(p)
+    offset = (first[mine] - first[theirs]) / step[theirs, None]
+    onto = _bilinear(h, step[mine] / step[theirs], offset)
     near = np.asarray(belief, np.float32)[..., None, None] * pooled(p)
+    # Rows first: one product each way serves all kinds.
+    left, right = (near[:, side].swapaxes(1, 2) for side in (_KIND, _MIRROR[_KIND]))
+    own = np.ones((), np.float32)
     for _ in range(ROUNDS):
-        left = near * own
-        claims = np.maximum(left[:, _KIND], left[:, _MIRROR[_KIND]])
+        claims = np.maximum(left * own, right * own)
         everybody = claims.copy()
-        for (i, k), (across, down) in onto.items():
-            everybody[i] += down @ claims[k] @ across.T
-        own = (claims / np.maximum(everybody, _TINY))[:, _KIND_OF]
-    return own
+        for i, k, (across, down) in zip(mine, theirs, onto, strict=True):
+            moved = (down @ claims[k].reshape(h, -1)).reshape(-1, h) @ across.T
+            everybody[i] += moved.reshape(claims[k].shape)
+        own = claims / np.maximum(everybody, _TINY)
+    shared: Maps = own.swapaxes(1, 2)[:, _KIND_OF]
+    return shared
 
 
-def _meet(first: Floats, step: Floats, size: int, i: int, k: int) -> bool:
-    """Whether two crops of ``size`` cells overlap."""
-    ends = first + size * step[:, None]
-    return bool((np.maximum(first[i], first[k]) < np.minimum(ends[i], ends[k])).all())
+def _bilinear(size: int, step: Floats, first: Floats) -> NDArray[np.float32]:
+    """Rows that interpolate at ``first + step * row``, nothing beyond the ends.
 
-
-def _bilinear(size: int, step: float, first: float) -> NDArray[np.float32]:
-    """(size, size): row r interpolates at ``first + step * r``, with nothing beyond the ends."""
-    at = first + step * np.arange(size)
-    rows = np.maximum(0.0, 1.0 - np.abs(at[:, None] - np.arange(size)))
-    return np.asarray(rows, np.float32)
+    (P, A, size, size) of ``step`` (P,) and ``first`` (P, A), in cells.
+    """
+    row = np.arange(size)
+    at = first[..., None] + step[:, None, None] * row
+    return np.asarray(np.maximum(0.0, 1.0 - np.abs(at[..., None] - row)), np.float32)
