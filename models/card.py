@@ -93,6 +93,9 @@ class LiftOutput(_Frozen):
 
     kind: Literal["lift"]
     joint_names: list[str]
+    reads_confidence: bool = Field(
+        False, description="beside each joint it takes how probably it is right, not only whether"
+    )
 
     @property
     def side_px(self) -> None:

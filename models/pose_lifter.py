@@ -1,8 +1,9 @@
 """p(X | x), learned: 2D joints to where they are in 3D, and how far that may be wrong.
 
 A small residual MLP after Martinez et al. (ICCV 2017). It knows neither size nor distance: joints
-go in as the camera sees them, and out come, for each, where in the image it really is and how much
-nearer or farther than the hips, relative to the hips' own distance. The architecture is in
+go in as the camera sees them and with how probably each is right, and out come, for each, where in
+the image it really is and how much nearer or farther than the hips, relative to the hips' own
+distance. The architecture is in
 ``models.training.lifter_network``, what it is trained on in ``models.training.lifter_samples``.
 """
 
@@ -47,6 +48,7 @@ class PoseLifter:
             raise ModelError(f"model {name} is no lifter: its card says {output.kind}")
         if tuple(output.joint_names) != LSP14.joint_names:
             raise ModelError(f"model {name} has other joints than lsp14: {output.joint_names}")
+        self._reads_confidence = output.reads_confidence
 
     @property
     def card(self) -> ModelCard:
@@ -58,18 +60,19 @@ class PoseLifter:
         """The provider in use and the precision it runs the network in."""
         return self._model.runtime
 
-    def lift(self, points: Floats, present: Floats) -> LearnedPose:
+    def lift(self, points: Floats, confidence: Floats) -> LearnedPose:
         """Lift one person.
 
         Args:
             points: (14, 2) normalised image coordinates, the camera turned onto the person.
-            present: (14,) 0 = missing, whose point is ignored; two joints at least.
+            confidence: (14,) how probably each is right; 0 = missing, whose point is ignored. Two
+                joints at least.
 
         """
-        seen = (present > 0)[:, None]
+        seen = (confidence > 0)[:, None]
         joints = np.empty((1, LSP14.n_joints, 3), np.float32)
         joints[0, :, :2] = np.where(seen, points, 0.0)
-        joints[0, :, 2:] = seen
+        joints[0, :, 2:] = confidence[:, None] if self._reads_confidence else seen
         answer = self._model.run(joints)[0].astype(np.float64)
         n = 2 * LSP14.n_joints
         return LearnedPose(answer[0, :n].reshape(-1, 2), answer[0, n:], answer[1:])

@@ -272,7 +272,7 @@ class Lifter:
         covariance = view.covariance
         if covariance is not None:
             covariance = covariance * ensemble.px_per_unit**2
-        learned = None if self._network is None else self._network.lift(view.points, weights)
+        learned = None if self._network is None else self._network.lift(view.points, confidence)
         return fuse(ensemble, view.points, confidence, covariance, self._settings.fusion, learned)
 
     def _shortlist(

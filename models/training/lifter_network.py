@@ -1,10 +1,12 @@
 """The learned lifter in torch, and as an ONNX graph: a residual MLP from 2D joints to a pose.
 
-After Martinez et al. (ICCV 2017), with 14 joints, a mask of missing ones, RMS norm in place of
+After Martinez et al. (ICCV 2017), with 14 joints, a mask of missing ones, the doubt in each of the
+others (how probably it is elsewhere, 0 for exact ones and for missing ones), RMS norm in place of
 batch norm, and everything in units that hold at any size and distance: ``c`` and ``r`` are the mean
 and the RMS radius of the present joints in normalised image coordinates.
 
-    f = ((x - c) / r, present, log r);   h₀ = relu(W f);   h ← h + V relu(U h / rms(h)) per block
+    f = ((x - c) / r, present, log r, doubt);
+    h₀ = relu(W f);   h ← h + V relu(U h / rms(h)) per block
 
 Of the last layer: where the joints really are in the image, as a correction in units of r; depths
 about the root's, ``z / z_root - 1``, in units of r; the logarithm of the body's radius in mm,
@@ -16,16 +18,19 @@ are, the library says.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import onnx
 import torch
 from numpy.typing import NDArray
+from onnx import numpy_helper
 from torch import Tensor, nn
 from torch.nn import functional
 
 from library_store.skeleton import L_HIP, LSP14, R_HIP
-from models.training.onnx_graph import GraphWriter
+from models.errors import ModelError
+from models.training.onnx_graph import HALF, PREFIX, GraphWriter
 
 N = LSP14.n_joints
 LOG_RADIUS = -2.0
@@ -34,8 +39,11 @@ LOG_SIZE = 5.75
 """About that of a person's radius in mm."""
 _RMS_FLOOR = 1e-4
 _TINY = 1e-12
+_BYTES, _SCALE = ".bytes", ".scale"
+"""How the parts of a weight in 8 bits are called."""
 _WEIGHT_LEVELS = 63
 """Of 8-bit weights to either side of 0: with 7 bits no CPU's 16-bit sums of products overflow."""
+N_FEATURES = 4 * N + 1
 _IMAGE, _DEPTH = slice(0, 2 * N), slice(2 * N, 3 * N)
 _SIZE = 3 * N
 _ACROSS, _ALONG = slice(3 * N + 1, 4 * N + 1), slice(4 * N + 1, 5 * N + 1)
@@ -43,11 +51,11 @@ _SIZE_SIGMA = 5 * N + 1
 
 
 class PoseMlp(nn.Module):
-    """Features (N, 43) -> the last layer (N, 72), float32; see the module."""
+    """Features (N, 57) -> the last layer (N, 72), float32; see the module."""
 
     def __init__(self, width: int = 512, n_blocks: int = 3) -> None:
         super().__init__()
-        self.first = nn.Linear(3 * N + 1, width)
+        self.first = nn.Linear(N_FEATURES, width)
         self.blocks = nn.ModuleList(
             nn.ModuleList((nn.Linear(width, width), nn.Linear(width, width)))
             for _ in range(n_blocks)
@@ -77,14 +85,18 @@ def _unit(hidden: Tensor) -> Tensor:
     return hidden * torch.rsqrt((hidden * hidden).mean(1, keepdim=True) + _RMS_FLOOR)
 
 
-def normalised(points: Tensor, present: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Features (N, 43), c (N, 1, 2), r (N, 1, 1) of points (N, 14, 2) and their mask (N, 14)."""
+def normalised(points: Tensor, present: Tensor, doubt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Features (N, 57), c (N, 1, 2), r (N, 1, 1).
+
+    Of points (N, 14, 2), their mask (N, 14) and the doubt in them (N, 14).
+    """
     shares = (present / present.sum(1, keepdim=True))[..., None]
     centre = (shares * points).sum(1, keepdim=True)
     centred = (points - centre) * present[..., None]
     radius = torch.sqrt((shares * centred**2).sum((1, 2), keepdim=True) + _TINY)
     shape = (centred / radius).flatten(1)
-    return torch.cat([shape, present, radius.log()[:, 0] - LOG_RADIUS], 1), centre, radius
+    log_radius = radius.log()[:, 0] - LOG_RADIUS
+    return torch.cat([shape, present, log_radius, doubt], 1), centre, radius
 
 
 @dataclass(frozen=True)
@@ -136,11 +148,34 @@ def losses(last: Tensor, image: Tensor, depths: Tensor, log_size: Tensor) -> tup
     return distance, surprise + 0.1 * foretold.mean()
 
 
+def read_network(path: Path) -> PoseMlp:
+    """The network that ``lifter_model`` wrote, to go on from; hidden weights as they were rounded.
+
+    Raises ``ModelError`` for any other file.
+    """
+    try:
+        stored = {
+            i.name.removeprefix(PREFIX).removesuffix(HALF): numpy_helper.to_array(i)
+            for i in onnx.load(path).graph.initializer
+            if i.name.startswith(PREFIX)
+        }
+        for name in [name for name in stored if name.endswith(_BYTES)]:
+            whole = name.removesuffix(_BYTES)
+            stored[whole] = (stored.pop(name) * stored.pop(whole + _SCALE)).T
+        network = PoseMlp(len(stored["first.bias"]), sum(".0.bias" in name for name in stored))
+        parts = {name: torch.tensor(value.astype(np.float32)) for name, value in stored.items()}
+        network.load_state_dict(parts)
+    except Exception as error:  # a reader of foreign bytes fails in every way
+        raise ModelError(f"{path} cannot be read as a lifter: {error}") from error
+    return network
+
+
 def lifter_model(network: PoseMlp, moments: NDArray[np.float64]) -> onnx.ModelProto:
     """The network as ``models.pose_lifter`` runs it.
 
-    Joints (n, 14, 3), x and y in normalised image coordinates and whether they are there, to
-    (n, 43, 42): a state (x, y of each joint, then the depths) and the covariance of its errors.
+    Joints (n, 14, 3), x and y in normalised image coordinates and how probably they are right (0
+    for missing ones), to (n, 43, 42): a state (x, y of each joint, then the depths) and the
+    covariance of its errors.
     Each person is seen in a mirror too and the two answers averaged, so that left and right are
     the same to it.
 
@@ -179,7 +214,8 @@ def lifter_model(network: PoseMlp, moments: NDArray[np.float64]) -> onnx.ModelPr
     flipped = w.node("Gather", "joints", w.constant(mirror), axis=1)
     flipped = w.node("Mul", flipped, w.constant(np.array([-1, 1, 1], np.float32)))
     both = w.node("Concat", "joints", flipped, axis=0)
-    points, present = cut(both, 0, 2, 2), cut(both, 2, 3, 2)
+    points, belief = cut(both, 0, 2, 2), cut(both, 2, 3, 2)
+    present = w.node("Cast", w.node("Greater", belief, number(0.0)), to=onnx.TensorProto.FLOAT)
     shares = w.node("Div", present, sum_over(present, 1))
     centre = sum_over(w.node("Mul", shares, points), 1)
     centred = w.node("Mul", w.node("Sub", points, centre), present)
@@ -187,6 +223,7 @@ def lifter_model(network: PoseMlp, moments: NDArray[np.float64]) -> onnx.ModelPr
     radius = w.node("Sqrt", w.node("Add", sum_over(square, 1, 2), number(_TINY)))
     shape = w.node("Reshape", w.node("Div", centred, radius), w.shape(-1, 2 * N))
     mask = w.node("Reshape", present, w.shape(-1, N))
+    doubt = w.node("Reshape", w.node("Sub", present, belief), w.shape(-1, N))
     flat_radius = w.node("Reshape", radius, w.shape(-1, 1))
     log_radius = w.node("Sub", w.node("Log", flat_radius), number(LOG_RADIUS))
 
@@ -201,9 +238,12 @@ def lifter_model(network: PoseMlp, moments: NDArray[np.float64]) -> onnx.ModelPr
         rounded = np.round(weight / scale).astype(np.int8)
         parts = [f"{value}_{part}" for part in ("bytes", "scale", "zero")]
         w.nodes("DynamicQuantizeLinear", [value], parts)
-        product = w.node("MatMulInteger", parts[0], w.constant(rounded), parts[2])
+        stored = PREFIX + w.name_of(module) + ".weight"
+        weights = w.constant(rounded, stored + _BYTES)
+        product = w.node("MatMulInteger", parts[0], weights, parts[2])
         product = w.node("Cast", product, to=onnx.TensorProto.FLOAT)
-        scale_of = w.node("Mul", parts[1], w.constant(scale.astype(np.float32)))
+        scales = w.constant(scale.astype(np.float32), stored + _SCALE)
+        scale_of = w.node("Mul", parts[1], scales)
         product = w.node("Mul", product, scale_of)
         return w.node("Add", product, w.parameter(module, "bias"))
 
@@ -211,7 +251,7 @@ def lifter_model(network: PoseMlp, moments: NDArray[np.float64]) -> onnx.ModelPr
         square = w.node("ReduceMean", w.node("Mul", value, value), axes=[1], keepdims=1)
         return w.node("Div", value, w.node("Sqrt", w.node("Add", square, number(_RMS_FLOOR))))
 
-    features = w.node("Concat", shape, mask, log_radius, axis=1)
+    features = w.node("Concat", shape, mask, log_radius, doubt, axis=1)
     hidden = w.node("Relu", linear(features, network.first))
     for inner, outer in network.blocks:  # type: ignore[misc]
         step = w.node("Relu", linear_in_8_bits(unit(hidden), inner))

@@ -3,12 +3,13 @@
 Half of the people have other proportions than the prior's, and joints in slightly other places, as
 other skeletons define them: bodies it will meet are not those of any mocap. Joints are noisy (in a
 quarter of the samples not at all, in others each as much as it likes), one may be elsewhere, some
-may be missing.
+may be missing. What pose networks mistake, lifter_mistakes.py adds.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,34 +37,68 @@ class Samples:
     """2D in, 3D out, in the view of a camera turned onto the joints that are there.
 
     ``points`` (n, 14, 2) normalised image coordinates, 0 where missing; ``present`` (n, 14);
+    ``doubt`` (n, 14) how probably a present joint is elsewhere, as a pose network would say;
     ``truth`` (n, 14, 2) where they really are; ``depths`` (n, 14) relative to the hip midpoint's,
     ``z / z_root - 1``; ``root_mm`` (n,) its depth.
     """
 
     points: Floats
     present: Floats
+    doubt: Floats
     truth: Floats
     depths: Floats
     root_mm: Floats
 
+    def taken(self, rows: NDArray[np.int64]) -> Samples:
+        """Those of these rows, in their order."""
+        return Samples(*(column[rows] for column in vars(self).values()))
+
 
 def draw(poses_mm: Floats, n: int, rng: np.random.Generator) -> Samples:
     """``n`` samples of root-centred poses (P, 14, 3), Y up."""
-    seen = _seen(_people(poses_mm, n, rng), n, rng)
+    seen = seen_people(poses_mm, n, rng)
     root = _root_depth(seen)
     points = seen[..., :2] / seen[..., 2:]
     points = points + _noise_mm(n, rng) / root[:, None, None]
     present = _present(n, rng)
+    return samples_of(points, present, np.zeros_like(present), seen)
+
+
+def samples_of(points: Floats, present: Floats, doubt: Floats, joints_mm: Floats) -> Samples:
+    """Samples of people (n, 14, 3) mm before the camera, whose joints were seen at ``points``."""
     turn, rays = _onto_axis(points, present)
-    turned, truth = rays @ turn, seen @ turn
+    turned, truth = rays @ turn, joints_mm @ turn
     depth = _root_depth(truth)
     return Samples(
         points=turned[..., :2] / turned[..., 2:] * present[..., None],
         present=present,
+        doubt=doubt * present,
         truth=truth[..., :2] / truth[..., 2:],
         depths=truth[..., 2] / depth[:, None] - 1.0,
         root_mm=depth,
     )
+
+
+def in_mirror(samples: Samples) -> Samples:
+    """What is seen of the same people in a mirror; their truth stays."""
+    order = list(LSP14.mirror)
+    return replace(
+        samples,
+        points=(samples.points * IN_MIRROR[:2])[:, order],
+        present=samples.present[:, order],
+        doubt=samples.doubt[:, order],
+    )
+
+
+def joined(parts: Sequence[Samples]) -> Samples:
+    """All samples of all parts, in order."""
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return Samples(*(np.concatenate(column) for column in columns))
+
+
+def seen_people(poses_mm: Floats, n: int, rng: np.random.Generator) -> Floats:
+    """``n`` people of various builds (n, 14, 3) in poses (P, 14, 3), before a camera each, mm."""
+    return _seen(_people(poses_mm, n, rng), n, rng)
 
 
 def _people(poses_mm: Floats, n: int, rng: np.random.Generator) -> Floats:

@@ -42,6 +42,10 @@ class GraphWriter:
         self._nodes: list[onnx.NodeProto] = []
         self._initializers: dict[str, onnx.TensorProto] = {}
 
+    def name_of(self, module: nn.Module) -> str:
+        """The module's name within the network."""
+        return self._names[id(module)]
+
     def node(self, operator: str, *inputs: str, name: str = "", **attributes: object) -> str:
         """Add a node with one output."""
         out = name or f"{operator.lower()}_{len(self._nodes)}"

@@ -1,14 +1,18 @@
 """Train the learned lifter: ``python -m models.training.train_lifter --out models/weights``.
 
-It learns from the pose prior alone (``library_store.prior_data``; ``--prior`` for another), so that
-it can be made again from what is in the repository. Twenty minutes of one core with AMX; the rate
-of learning falls to nothing over ``--minutes`` of wall time, and an average of the weights is kept.
+It learns from the pose prior (``library_store.prior_data``; ``--prior`` for another), which needs
+nothing but what is in the repository; then, by ``--init`` of what that made and ``--mistakes`` of
+``models.training.lifter_mistakes``, from what a pose network gets wrong. Twenty minutes of one core
+for the first, eight for the second; the rate of learning falls to nothing over ``--minutes`` of
+wall time, and an average of the weights is kept.
 """
 
 from __future__ import annotations
 
 import argparse
+import copy
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +24,7 @@ from library_store.prior import DEFAULT_PRIOR, PosePrior
 from library_store.skeleton import LSP14
 from models.card import WEIGHTS_DIR, LiftOutput, ModelCard
 from models.training.export import publish
+from models.training.lifter_mistakes import Mistakes, Transplanter
 from models.training.lifter_network import (
     LOG_SIZE,
     PoseMlp,
@@ -27,8 +32,9 @@ from models.training.lifter_network import (
     losses,
     normalised,
     read_last,
+    read_network,
 )
-from models.training.lifter_samples import IN_MIRROR, Floats, Samples, draw
+from models.training.lifter_samples import Floats, Samples, draw, in_mirror, joined
 from models.training.precision import has_bf16
 
 CHUNK, BATCH, POOL, MEASURED = 16_384, 1_024, 250_000, 16_384
@@ -37,18 +43,44 @@ COMPILED = 3
 """The clock starts after so many steps: the first ones take a minute to compile."""
 SURPRISE = 0.05
 """Weight of how well errors are foretold against how small they are."""
+MISTAKEN = (
+    "mistakes of our pose network about rendered people: MakeHuman bodies (CC0) in CMU mocap poses"
+)
 
 
-def train(poses_mm: Floats, minutes: float, seed: int) -> tuple[PoseMlp, int]:
+Draw = Callable[[int, np.random.Generator], Samples]
+
+
+def drawing(poses_mm: Floats, mistakes: Mistakes | None) -> Draw:
+    """What draws samples: of the prior, or half of them mistaken, a sixth of known people."""
+    if mistakes is None:
+        return lambda n, rng: draw(poses_mm, n, rng)
+    transplanter = Transplanter(mistakes)
+
+    def mixed(n: int, rng: np.random.Generator) -> Samples:
+        mistaken, known = n // 2, n // 6
+        parts = [
+            transplanter.samples(poses_mm, mistaken, rng),
+            mistakes.people(known, rng),
+            draw(poses_mm, n - mistaken - known, rng),
+        ]
+        return joined(parts).taken(rng.permutation(n))
+
+    return mixed
+
+
+def train(
+    drawn: Draw, minutes: float, seed: int, *, rate: float = RATE, start: PoseMlp | None = None
+) -> tuple[PoseMlp, int]:
     """The averaged network after so long, and how many samples it has seen."""
     rng = np.random.default_rng(seed)
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     bf16 = has_bf16("cpu")
-    network, average = PoseMlp(), PoseMlp()
-    average.load_state_dict(network.state_dict())
+    network = PoseMlp() if start is None else start
+    average = copy.deepcopy(network)
     optimiser = torch.optim.AdamW(
-        network.parameters(), lr=RATE, betas=(0.9, 0.99), weight_decay=0.01, fused=True
+        network.parameters(), lr=rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True
     )
 
     @torch.compile
@@ -60,15 +92,15 @@ def train(poses_mm: Floats, minutes: float, seed: int) -> tuple[PoseMlp, int]:
 
     started, spoken, step, spent = time.monotonic(), 0.0, 0, 0.0
     while spent < 1.0:
-        chunk = tensors(draw(poses_mm, CHUNK, rng))
+        chunk = tensors(drawn(CHUNK, rng))
         for first in range(0, CHUNK, BATCH):
             if step == COMPILED:
                 started = time.monotonic()
             spent = (time.monotonic() - started) / (60.0 * minutes)
             cooled = max(0.0, (spent - STEADY) / (1.0 - STEADY))
-            rate = min(1.0, (step + 1) / WARM_UP_STEPS) * 0.5 * (1.0 + np.cos(np.pi * cooled))
+            share = min(1.0, (step + 1) / WARM_UP_STEPS) * 0.5 * (1.0 + np.cos(np.pi * cooled))
             for group in optimiser.param_groups:
-                group["lr"] = RATE * max(rate, 1e-3)
+                group["lr"] = rate * max(share, 1e-3)
             loss, distance = loss_of(*(part[first : first + BATCH] for part in chunk))
             optimiser.zero_grad()
             loss.backward()
@@ -89,17 +121,10 @@ def train(poses_mm: Floats, minutes: float, seed: int) -> tuple[PoseMlp, int]:
 
 def tensors(samples: Samples) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Features, and what the last layer should say of them: see ``lifter_network.losses``."""
-    points, present, truth, depths, root_mm = (
-        torch.from_numpy(np.ascontiguousarray(part, np.float32))
-        for part in (
-            samples.points,
-            samples.present,
-            samples.truth,
-            samples.depths,
-            samples.root_mm,
-        )
+    points, present, doubt, truth, depths, root_mm = (
+        torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in vars(samples).values()
     )
-    features, centre, radius = normalised(points, present)
+    features, centre, radius = normalised(points, present, doubt)
     given = (points - centre) / radius * present[..., None]
     log_size = torch.log(radius[:, 0, 0] * root_mm) - LOG_SIZE
     return features, (truth - centre) / radius - given, depths / radius[:, 0], log_size
@@ -109,16 +134,9 @@ def error_moments(network: PoseMlp, samples: Samples) -> NDArray[np.float64]:
     """Second moments (42, 42) of errors in units of the foretold deviations, mirror included."""
     features, image, depths, _ = tensors(samples)
     mirror = list(LSP14.mirror)
-    flipped = Samples(
-        (samples.points * IN_MIRROR[:2])[:, mirror],
-        samples.present[:, mirror],
-        samples.truth,
-        samples.depths,
-        samples.root_mm,
-    )
     with torch.no_grad():
         plain = read_last(network(features))
-        other = read_last(network(tensors(flipped)[0]))
+        other = read_last(network(tensors(in_mirror(samples))[0]))
     sides = torch.tensor([-1.0, 1.0])
     found = 0.5 * (plain.image + (other.image * sides)[:, mirror])
     along = 0.5 * (plain.depths + other.depths[:, mirror])
@@ -137,14 +155,20 @@ def error_moments(network: PoseMlp, samples: Samples) -> NDArray[np.float64]:
     joints = np.array(mirror)
     order = np.concatenate([(2 * joints[:, None] + [0, 1]).ravel(), 2 * n + joints])
     signs = np.concatenate([np.tile([-1.0, 1.0], n), np.ones(n)])
-    in_mirror = moments[np.ix_(order, order)] * np.outer(signs, signs)
-    return 0.5 * (moments + in_mirror)
+    mirrored = moments[np.ix_(order, order)] * np.outer(signs, signs)
+    return 0.5 * (moments + mirrored)
 
 
 def lifter_card(
-    network: PoseMlp, name: str, version: str, prior: PosePrior, measured: dict[str, float | str]
+    network: PoseMlp,
+    name: str,
+    version: str,
+    prior: PosePrior,
+    measured: dict[str, float | str],
+    *,
+    mistaken: bool,
 ) -> ModelCard:
-    """The card of a trained network."""
+    """The card of a trained network; ``mistaken``: it has seen what a pose network mistakes."""
     layers = [p.numel() for p in network.parameters() if p.ndim == 2]
     return ModelCard(
         name=name,
@@ -156,11 +180,12 @@ def lifter_card(
         providers=("cpu",),
         parameters=sum(p.numel() for p in network.parameters()),
         multiply_adds=2 * sum(layers),
-        output=LiftOutput(kind="lift", joint_names=list(LSP14.joint_names)),
+        output=LiftOutput(kind="lift", joint_names=list(LSP14.joint_names), reads_confidence=True),
         training_data=[
             f"poses drawn from the pose prior {prior.card.name} {prior.card.version}, fitted on "
             "the CMU Graphics Lab Motion Capture Database (free for all uses), seen by made-up "
-            "cameras; no photo"
+            "cameras",
+            *([MISTAKEN] if mistaken else ["no photo"]),
         ],
         licence="Apache-2.0",
         limits=[
@@ -180,37 +205,44 @@ def main() -> None:
     parser.add_argument("--name", default="lifter")
     parser.add_argument("--version", default="0.1.0")
     parser.add_argument("--minutes", type=float, default=20.0)
+    parser.add_argument("--rate", type=float, default=RATE, help="of learning, at its highest")
+    parser.add_argument("--init", type=Path, help="go on from this .onnx of an earlier run")
+    parser.add_argument("--mistakes", type=Path, help="what models.training.lifter_mistakes wrote")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     prior = PosePrior.load(chosen.prior)
     rng = np.random.default_rng(chosen.seed)
     poses = prior.sample(POOL, rng).astype(np.float32)
-    network, n = train(poses, chosen.minutes, chosen.seed)
-    save(network, n, prior, poses, chosen.out, name=chosen.name, version=chosen.version)
+    mistakes = None if chosen.mistakes is None else Mistakes.read(chosen.mistakes)
+    start = None if chosen.init is None else read_network(chosen.init)
+    drawn = drawing(poses, mistakes)
+    network, n = train(drawn, chosen.minutes, chosen.seed, rate=chosen.rate, start=start)
+    measured: dict[str, float | str] = {
+        "samples": float(n),
+        "prior_sha256": prior.sha256,
+        "command": "python -m models.training.train_lifter" + _options(chosen),
+    }
+    if mistakes is not None:
+        measured["people_with_mistakes"] = float(len(mistakes))
+    card = lifter_card(
+        network, chosen.name, chosen.version, prior, measured, mistaken=mistakes is not None
+    )
+    save(network, card, drawn, chosen.out)
 
 
-def save(
-    network: PoseMlp,
-    n_samples: int,
-    prior: PosePrior,
-    poses_mm: Floats,
-    directory: Path,
-    *,
-    name: str,
-    version: str,
-) -> ModelCard:
+def _options(chosen: argparse.Namespace) -> str:
+    given = {"--init": chosen.init, "--mistakes": chosen.mistakes}
+    return "".join(f" {option} {path.name}" for option, path in given.items() if path is not None)
+
+
+def save(network: PoseMlp, card: ModelCard, drawn: Draw, directory: Path) -> ModelCard:
     """Measure the network's errors on fresh samples and write it with its card."""
-    samples = draw(poses_mm, MEASURED, np.random.default_rng(9))
+    samples = drawn(MEASURED, np.random.default_rng(9))
     with torch.no_grad():
         features, *wanted = tensors(samples)
         distance, _ = losses(network(features), *wanted)
-    measured: dict[str, float | str] = {
-        "samples": float(n_samples),
-        "mean_error/fresh_samples_in_radii": round(float(distance), 4),
-        "prior_sha256": prior.sha256,
-        "command": "python -m models.training.train_lifter",
-    }
-    card = lifter_card(network, name, version, prior, measured)
+    error = {"mean_error/fresh_samples_in_radii": round(float(distance), 4)}
+    card = card.model_copy(update={"measured": error | card.measured})
     return publish(lifter_model(network, error_moments(network, samples)), card, directory)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +14,56 @@ pytest.importorskip("onnx")
 from torch import Tensor  # noqa: E402
 
 from library_store.prior import PosePrior  # noqa: E402
-from library_store.skeleton import LSP14  # noqa: E402
-from models import PoseLifter  # noqa: E402
+from library_store.skeleton import L_ANKLE, LSP14, R_ANKLE  # noqa: E402
+from models import ModelError, PoseLifter  # noqa: E402
+from models.card import WEIGHTS_DIR  # noqa: E402
 from models.training import lifter_samples, train_lifter  # noqa: E402
-from models.training.lifter_network import PoseMlp, losses, read_last  # noqa: E402
-from models.training.lifter_samples import IN_MIRROR, Floats, Samples, draw  # noqa: E402
+from models.training.lifter_mistakes import Mistakes, Transplanter  # noqa: E402
+from models.training.lifter_network import (  # noqa: E402
+    PoseMlp,
+    losses,
+    read_last,
+    read_network,
+)
+from models.training.lifter_samples import (  # noqa: E402
+    Floats,
+    Samples,
+    draw,
+    in_mirror,
+    joined,
+    seen_people,
+)
 
 
 @pytest.fixture(scope="module")
 def poses() -> Floats:
     return PosePrior.load().sample(200, np.random.default_rng(3)).astype(np.float32)
+
+
+def doubted(samples: Samples) -> Samples:
+    """The same people, seen by a network that is not sure of their joints."""
+    drawn = np.random.default_rng(7).uniform(0, 0.8, samples.present.shape)
+    return replace(samples, doubt=(drawn * samples.present).astype(np.float32))
+
+
+def written(network: PoseMlp, poses: Floats, folder: Path) -> PoseLifter:
+    """The network as the service runs it."""
+    card = train_lifter.lifter_card(network, "tiny", "1", PosePrior.load(), {}, mistaken=False)
+    train_lifter.save(network, card, train_lifter.drawing(poses, None), folder)
+    return PoseLifter("tiny", weights_dir=folder)
+
+
+def mistaken(n: int = 60) -> Mistakes:
+    """People in mid-stride whose right ankle was put on the left one, without much confidence."""
+    poses = PosePrior.load().sample(200, np.random.default_rng(4)).astype(np.float32)
+    joints = seen_people(poses, 10 * n, np.random.default_rng(5))
+    truth = joints[..., :2] / joints[..., 2:]
+    radius = np.sqrt(((truth - truth.mean(1, keepdims=True)) ** 2).sum(2).mean(1))
+    stride = np.linalg.norm(truth[:, R_ANKLE] - truth[:, L_ANKLE], axis=1) / radius
+    joints, truth = (part[np.argsort(-stride)[:n]] for part in (joints, truth))
+    found, confidence = truth.copy(), np.full((n, 14), 0.95, np.float32)
+    found[:, R_ANKLE], confidence[:, R_ANKLE] = truth[:, L_ANKLE], 0.4
+    return Mistakes(found, confidence, truth, joints)
 
 
 def test_samples_without_noise_are_where_they_are(
@@ -48,22 +89,15 @@ def test_the_graph_says_what_the_network_says(poses: Floats, tmp_path: Path) -> 
     network = PoseMlp(width=32, n_blocks=2)
     with torch.no_grad():
         network.last.weight.normal_(0.0, 0.2)
-    samples = draw(poses, 64, np.random.default_rng(1))
-    train_lifter.save(network, 0, PosePrior.load(), poses, tmp_path, name="tiny", version="1")
-    lifter = PoseLifter("tiny", weights_dir=tmp_path)
+    samples = doubted(draw(poses, 64, np.random.default_rng(1)))
+    lifter = written(network, poses, tmp_path)
     mirror = list(LSP14.mirror)
-    flipped = Samples(
-        (samples.points * IN_MIRROR[:2])[:, mirror],
-        samples.present[:, mirror],
-        samples.truth,
-        samples.depths,
-        samples.root_mm,
-    )
     for row in range(3):
-        found = lifter.lift(samples.points[row].astype(np.float64), samples.present[row])
+        belief = samples.present[row] - samples.doubt[row]
+        found = lifter.lift(samples.points[row].astype(np.float64), belief)
         said = []
-        for view in (samples, flipped):
-            one = Samples(*(part[row : row + 1] for part in vars(view).values()))
+        for view in (samples, in_mirror(samples)):
+            one = view.taken(np.array([row]))
             with torch.no_grad():
                 said.append(read_last(network(train_lifter.tensors(one)[0])).depths[0].numpy())
         there = samples.present[row, :, None]
@@ -90,3 +124,71 @@ def test_the_loss_is_least_at_the_truth_and_at_honest_deviations(poses: Floats) 
         float(losses(last(0.3, np.log(sigma)), image, depths, size)[1]) for sigma in (0.1, 0.3, 0.9)
     ]
     assert min(surprises) == surprises[1]
+
+
+def test_training_goes_on_from_what_was_written(poses: Floats, tmp_path: Path) -> None:
+    torch.manual_seed(2)
+    network = PoseMlp(width=32, n_blocks=2)
+    with torch.no_grad():
+        network.last.weight.normal_(0.0, 0.2)
+    written(network, poses, tmp_path)
+    again = read_network(tmp_path / "tiny.onnx")
+    features = train_lifter.tensors(doubted(draw(poses, 64, np.random.default_rng(1))))[0]
+    with torch.no_grad():
+        np.testing.assert_allclose(again(features), network(features), atol=0.05)
+    with pytest.raises(ModelError, match="cannot be read as a lifter"):
+        read_network(WEIGHTS_DIR / "person.onnx")
+
+
+def test_mistakes_are_kept_whole(tmp_path: Path) -> None:
+    mistakes = mistaken()
+    mistakes.write(tmp_path / "mistakes.npz")
+    again = Mistakes.read(tmp_path / "mistakes.npz")
+    assert len(again) == 60
+    for name, value in vars(mistakes).items():
+        np.testing.assert_array_equal(getattr(again, name), value)
+
+
+def test_an_ankle_that_was_put_on_the_other_one_is_so_for_others_too(poses: Floats) -> None:
+    samples = Transplanter(mistaken()).samples(poses, 400, np.random.default_rng(6))
+    assert (samples.present == 1).all()
+    # Of people in the mirror it is the left ankle.
+    ankles = np.array([R_ANKLE, L_ANKLE])
+    wrong = samples.doubt[:, ankles] > 0.5
+    assert (wrong.sum(1) == 1).all()
+    assert 0.3 < wrong[:, 0].mean() < 0.7
+    there = samples.points[:, ankles[::-1]]
+    np.testing.assert_allclose(samples.points[:, ankles][wrong], there[wrong], atol=1e-4)
+    right = np.ones_like(samples.present, bool)
+    right[:, ankles] = ~wrong
+    np.testing.assert_allclose(samples.points[right], samples.truth[right], atol=1e-4)
+
+
+def test_known_people_come_as_they_were_found_and_in_the_mirror() -> None:
+    mistakes = mistaken()
+    samples = mistakes.people(300, np.random.default_rng(8))
+    wrong = samples.doubt[:, [R_ANKLE, L_ANKLE]] > 0.5
+    assert (wrong.sum(1) == 1).all()
+    assert 0.3 < wrong[:, 0].mean() < 0.7
+    heights = np.ptp(mistakes.joints_mm[..., 1], axis=1)
+    found = np.ptp(samples.truth[..., 1], axis=1) * samples.root_mm
+    assert heights.min() * 0.7 < np.median(found) < heights.max() * 1.3
+
+
+def test_joints_that_hardly_anything_says_are_missing() -> None:
+    mistakes = mistaken()
+    mistakes.confidence[:, R_ANKLE] = 0.1
+    samples = Transplanter(mistakes).samples(mistakes.joints_mm, 50, np.random.default_rng(1))
+    missing = samples.present == 0
+    assert (missing.sum(1) == 1).all()
+    assert (samples.points[missing] == 0).all()
+    assert (samples.doubt[missing] == 0).all()
+
+
+def test_half_of_what_is_drawn_is_mistaken(poses: Floats) -> None:
+    drawn = train_lifter.drawing(poses, mistaken())
+    samples = drawn(600, np.random.default_rng(2))
+    assert len(samples.points) == 600
+    assert (samples.doubt > 0.5).any(1).mean() == pytest.approx(2 / 3, abs=0.01)
+    again = joined([samples, samples])
+    np.testing.assert_array_equal(again.taken(np.arange(600, 1200)).points, samples.points)

@@ -1,0 +1,176 @@
+"""What pose networks get wrong, for the lifter to learn.
+
+On photos joints are not noisy but now and then elsewhere: on the other leg, exchanged with the
+other side, on somebody else. The network's confidence tells something of it. Rendered people
+(``models.training.rendered``) have the truth in 3D. This program has a pose network find their
+joints and keeps both:
+
+    python -m models.training.lifter_mistakes --renders A.tar B.tar --out FILE.npz
+
+``train_lifter --mistakes FILE.npz`` shows the lifter these people, and people of the pose prior
+with the mistakes of whoever of these is seen most like them.
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+
+from library_store.skeleton import LSP14
+from models.card import WEIGHTS_DIR
+from models.errors import AnnotationError
+from models.person_detector import PersonBox
+from models.pose_estimator import PoseEstimator
+from models.training.dataset import decode_members, read_annotations
+from models.training.lifter_samples import IN_MIRROR, Floats, Samples, samples_of, seen_people
+
+LEAST_CONFIDENCE, LEAST_JOINTS = 0.2, 6
+"""Joints of less confidence count as missing, as in the service; people with fewer are left out."""
+SHIFT, GROWTH = 0.03, 0.08
+"""Deviation of boxes from the true ones: of their place, in their longer side, and log size."""
+CANDIDATES = 512
+"""Among so many of the known people, drawn at random, the one seen most alike is looked for."""
+_ON_ANOTHER, _NEARER = 0.35, 0.5
+"""A joint counts as put on another one when it lies so many radii from the own one, and at less
+than such a share of that from the other."""
+_MIRROR = np.array(LSP14.mirror)
+
+
+@dataclass(frozen=True)
+class Mistakes:
+    """People (n) as a pose network found them.
+
+    ``found`` and ``truth`` (n, 14, 2) normalised image coordinates, ``confidence`` (n, 14),
+    ``joints_mm`` (n, 14, 3) in the camera frame.
+    """
+
+    found: Floats
+    confidence: Floats
+    truth: Floats
+    joints_mm: Floats
+
+    def __len__(self) -> int:
+        """How many people."""
+        return len(self.found)
+
+    def write(self, path: Path) -> None:
+        """As one npz."""
+        np.savez_compressed(path, **vars(self))
+
+    @staticmethod
+    def read(path: Path) -> Mistakes:
+        """What ``write`` wrote."""
+        with np.load(path, allow_pickle=False) as data:
+            return Mistakes(*(data[name] for name in Mistakes.__dataclass_fields__))
+
+    def people(self, n: int, rng: np.random.Generator) -> Samples:
+        """``n`` of these people themselves, half of them in the mirror."""
+        who = rng.integers(len(self), size=n)
+        flip = rng.random(n) < 0.5
+        found, confidence, joints = self.found[who], self.confidence[who], self.joints_mm[who]
+        found[flip] = (found[flip] * IN_MIRROR[:2])[:, _MIRROR]
+        joints[flip] = (joints[flip] * IN_MIRROR)[:, _MIRROR]
+        confidence[flip] = confidence[flip][:, _MIRROR]
+        return _samples(found, confidence, joints)
+
+
+class Transplanter:
+    """Gives people of the pose prior the mistakes of people who are seen like them.
+
+    Mistakes are kept as shapes, joints less their mean over their RMS radius: a joint that was put
+    on another one of the person goes to that one of the receiver, and what is left of the error is
+    added in units of the radius.
+    """
+
+    def __init__(self, mistakes: Mistakes) -> None:
+        truth, centre, radius = _shape(mistakes.truth)
+        found = (mistakes.found - centre) / radius
+        self._truth = _with_mirror(truth)
+        self._confidence = np.concatenate([mistakes.confidence, mistakes.confidence[:, _MIRROR]])
+        found = _with_mirror(found)
+        apart = np.linalg.norm(found[:, :, None] - self._truth[:, None], axis=-1)
+        own, nearest = apart.diagonal(axis1=1, axis2=2), apart.argmin(-1)
+        elsewhere = (own > _ON_ANOTHER) & (apart.min(-1) < _NEARER * own)
+        self._onto = np.where(elsewhere, nearest, np.arange(LSP14.n_joints))
+        self._rest = found - np.take_along_axis(self._truth, self._onto[..., None], 1)
+
+    def samples(self, poses_mm: Floats, n: int, rng: np.random.Generator) -> Samples:
+        """``n`` people in poses (P, 14, 3) of the prior, badly found."""
+        joints_mm = seen_people(poses_mm, n, rng)
+        shape, centre, radius = _shape(joints_mm[..., :2] / joints_mm[..., 2:])
+        known = rng.choice(len(self._truth), min(CANDIDATES, len(self._truth)), replace=False)
+        flat = self._truth[known].reshape(len(known), -1)
+        apart2 = (flat**2).sum(1) - 2 * shape.reshape(n, -1) @ flat.T
+        like = known[apart2.argmin(1)]
+        found = np.take_along_axis(shape, self._onto[like, :, None], 1) + self._rest[like]
+        return _samples(found * radius + centre, self._confidence[like], joints_mm)
+
+
+def _samples(found: Floats, confidence: Floats, joints_mm: Floats) -> Samples:
+    present = (confidence >= LEAST_CONFIDENCE).astype(np.float32)
+    return samples_of(found.astype(np.float32), present, 1 - confidence, joints_mm)
+
+
+def _shape(points: Floats) -> tuple[Floats, Floats, Floats]:
+    """(n, 14, 2) -> the shapes, and the means (n, 1, 2) and radii (n, 1, 1) taken from them."""
+    centre = points.mean(1, keepdims=True)
+    radius = np.sqrt(((points - centre) ** 2).sum(2).mean(1))[:, None, None]
+    return (points - centre) / radius, centre, radius
+
+
+def _with_mirror(shapes: Floats) -> Floats:
+    return np.concatenate([shapes, (shapes * IN_MIRROR[:2])[:, _MIRROR]])
+
+
+def find(renders: list[Path], estimator: PoseEstimator, rng: np.random.Generator) -> Mistakes:
+    """Have a network find the people of rendered sets, by boxes about as good as a detector's.
+
+    Raises ``AnnotationError`` for sets without the truth in 3D.
+    """
+    rows: list[tuple[NDArray[np.float64], ...]] = []
+    for path in renders:
+        images = decode_members(path)
+        records = read_annotations(path)
+        for record in track(records, path.name, transient=True, console=Console(stderr=True)):
+            if "joints_mm" not in record:
+                raise AnnotationError(f"{path} has no 3D truth: render it anew")
+            truth_px = np.array(record["joints_px"], np.float64)
+            low, size = truth_px.min(0), np.ptp(truth_px, axis=0)
+            middle = low + size / 2 + rng.normal(0, SHIFT, 2) * size.max()
+            size = size * np.exp(rng.normal(0, GROWTH))
+            (x, y), (width, height) = middle - size / 2, size
+            box = PersonBox(x, y, width, height, score=1.0)
+            (found,) = estimator.estimate(images[record["image"]], [box])
+            if (found.belief >= LEAST_CONFIDENCE).sum() < LEAST_JOINTS:
+                continue
+            centre, focal = np.array(record["principal_point_px"]), record["focal_length_px"]
+            normal = [(px - centre) / focal for px in (found.positions_px, truth_px)]
+            rows.append((normal[0], found.belief, normal[1], np.array(record["joints_mm"])))
+    return Mistakes(*(np.array(part, np.float32) for part in zip(*rows, strict=True)))
+
+
+def main() -> None:
+    """Command line: see the module."""
+    parser = argparse.ArgumentParser(prog="models.training.lifter_mistakes", description=__doc__)
+    parser.add_argument("--renders", type=Path, nargs="+", required=True, help="tars with 3D truth")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--name", default="cpm-int8")
+    parser.add_argument("--weights", type=Path, default=WEIGHTS_DIR)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    estimator = PoseEstimator(args.name, weights_dir=args.weights)
+    mistakes = find(args.renders, estimator, np.random.default_rng(args.seed))
+    mistakes.write(args.out)
+    print(f"{args.out}: {len(mistakes)} people, {args.out.stat().st_size / 1e6:.1f} MB")
+
+
+if __name__ == "__main__":
+    main()
