@@ -14,11 +14,10 @@ pytest.importorskip("onnx")
 from torch import Tensor  # noqa: E402
 
 from library_store.prior import PosePrior  # noqa: E402
-from library_store.skeleton import L_ANKLE, LSP14, R_ANKLE  # noqa: E402
+from library_store.skeleton import LSP14  # noqa: E402
 from models import ModelError, PoseLifter  # noqa: E402
 from models.card import WEIGHTS_DIR  # noqa: E402
 from models.training import lifter_samples, train_lifter  # noqa: E402
-from models.training.lifter_mistakes import Mistakes, Transplanter  # noqa: E402
 from models.training.lifter_network import (  # noqa: E402
     PoseMlp,
     losses,
@@ -31,8 +30,8 @@ from models.training.lifter_samples import (  # noqa: E402
     draw,
     in_mirror,
     joined,
-    seen_people,
 )
+from tests.models.training.test_lifter_mistakes import mistaken  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -51,19 +50,6 @@ def written(network: PoseMlp, poses: Floats, folder: Path) -> PoseLifter:
     card = train_lifter.lifter_card(network, "tiny", "1", PosePrior.load(), {}, mistaken=False)
     train_lifter.save(network, card, train_lifter.drawing(poses, None), folder)
     return PoseLifter("tiny", weights_dir=folder)
-
-
-def mistaken(n: int = 60) -> Mistakes:
-    """People in mid-stride whose right ankle was put on the left one, without much confidence."""
-    poses = PosePrior.load().sample(200, np.random.default_rng(4)).astype(np.float32)
-    joints = seen_people(poses, 10 * n, np.random.default_rng(5))
-    truth = joints[..., :2] / joints[..., 2:]
-    radius = np.sqrt(((truth - truth.mean(1, keepdims=True)) ** 2).sum(2).mean(1))
-    stride = np.linalg.norm(truth[:, R_ANKLE] - truth[:, L_ANKLE], axis=1) / radius
-    joints, truth = (part[np.argsort(-stride)[:n]] for part in (joints, truth))
-    found, confidence = truth.copy(), np.full((n, 14), 0.95, np.float32)
-    found[:, R_ANKLE], confidence[:, R_ANKLE] = truth[:, L_ANKLE], 0.4
-    return Mistakes(found, confidence, truth, joints)
 
 
 def test_samples_without_noise_are_where_they_are(
@@ -138,51 +124,6 @@ def test_training_goes_on_from_what_was_written(poses: Floats, tmp_path: Path) -
         np.testing.assert_allclose(again(features), network(features), atol=0.05)
     with pytest.raises(ModelError, match="cannot be read as a lifter"):
         read_network(WEIGHTS_DIR / "person.onnx")
-
-
-def test_mistakes_are_kept_whole(tmp_path: Path) -> None:
-    mistakes = mistaken()
-    mistakes.write(tmp_path / "mistakes.npz")
-    again = Mistakes.read(tmp_path / "mistakes.npz")
-    assert len(again) == 60
-    for name, value in vars(mistakes).items():
-        np.testing.assert_array_equal(getattr(again, name), value)
-
-
-def test_an_ankle_that_was_put_on_the_other_one_is_so_for_others_too(poses: Floats) -> None:
-    samples = Transplanter(mistaken()).samples(poses, 400, np.random.default_rng(6))
-    assert (samples.present == 1).all()
-    # Of people in the mirror it is the left ankle.
-    ankles = np.array([R_ANKLE, L_ANKLE])
-    wrong = samples.doubt[:, ankles] > 0.5
-    assert (wrong.sum(1) == 1).all()
-    assert 0.3 < wrong[:, 0].mean() < 0.7
-    there = samples.points[:, ankles[::-1]]
-    np.testing.assert_allclose(samples.points[:, ankles][wrong], there[wrong], atol=1e-4)
-    right = np.ones_like(samples.present, bool)
-    right[:, ankles] = ~wrong
-    np.testing.assert_allclose(samples.points[right], samples.truth[right], atol=1e-4)
-
-
-def test_known_people_come_as_they_were_found_and_in_the_mirror() -> None:
-    mistakes = mistaken()
-    samples = mistakes.people(300, np.random.default_rng(8))
-    wrong = samples.doubt[:, [R_ANKLE, L_ANKLE]] > 0.5
-    assert (wrong.sum(1) == 1).all()
-    assert 0.3 < wrong[:, 0].mean() < 0.7
-    heights = np.ptp(mistakes.joints_mm[..., 1], axis=1)
-    found = np.ptp(samples.truth[..., 1], axis=1) * samples.root_mm
-    assert heights.min() * 0.7 < np.median(found) < heights.max() * 1.3
-
-
-def test_joints_that_hardly_anything_says_are_missing() -> None:
-    mistakes = mistaken()
-    mistakes.confidence[:, R_ANKLE] = 0.1
-    samples = Transplanter(mistakes).samples(mistakes.joints_mm, 50, np.random.default_rng(1))
-    missing = samples.present == 0
-    assert (missing.sum(1) == 1).all()
-    assert (samples.points[missing] == 0).all()
-    assert (samples.doubt[missing] == 0).all()
 
 
 def test_half_of_what_is_drawn_is_mistaken(poses: Floats) -> None:

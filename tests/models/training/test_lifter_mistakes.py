@@ -1,0 +1,116 @@
+"""What pose networks get wrong: how it is found, kept and given to others."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from library_store.prior import PosePrior
+from library_store.skeleton import L_ANKLE, LSP14, R_ANKLE
+from models import PoseEstimator
+from models.errors import AnnotationError
+from models.training.lifter_mistakes import Mistakes, Transplanter, find
+from models.training.lifter_samples import Floats, seen_people
+
+RENDERS = Path("tests/data/renders")
+
+
+@pytest.fixture(scope="module")
+def poses() -> Floats:
+    return PosePrior.load().sample(200, np.random.default_rng(3)).astype(np.float32)
+
+
+def rendered(folder: Path, *, truth: bool = True) -> Path:
+    """The test renders as ``models.training.rendered`` lays them down."""
+    records = []
+    for image in json.loads((RENDERS / "ground_truth.json").read_text())["images"]:
+        shutil.copy(RENDERS / image["file"], folder)
+        record = {
+            "image": image["file"],
+            "joints_px": image["joints_2d_px"],
+            "focal_length_px": image["K"][0][0],
+            "principal_point_px": [image["K"][0][2], image["K"][1][2]],
+        }
+        records.append(record | ({"joints_mm": image["joints_3d_mm"]} if truth else {}))
+    listed = {"joint_names": list(LSP14.joint_names), "images": records}
+    (folder / "annotations.json").write_text(json.dumps(listed))
+    return folder
+
+
+def mistaken(n: int = 60) -> Mistakes:
+    """People in mid-stride whose right ankle was put on the left one, without much confidence."""
+    poses = PosePrior.load().sample(200, np.random.default_rng(4)).astype(np.float32)
+    joints = seen_people(poses, 10 * n, np.random.default_rng(5))
+    truth = joints[..., :2] / joints[..., 2:]
+    radius = np.sqrt(((truth - truth.mean(1, keepdims=True)) ** 2).sum(2).mean(1))
+    stride = np.linalg.norm(truth[:, R_ANKLE] - truth[:, L_ANKLE], axis=1) / radius
+    joints, truth = (part[np.argsort(-stride)[:n]] for part in (joints, truth))
+    found, confidence = truth.copy(), np.full((n, 14), 0.95, np.float32)
+    found[:, R_ANKLE], confidence[:, R_ANKLE] = truth[:, L_ANKLE], 0.4
+    return Mistakes(found, confidence, truth, joints)
+
+
+def test_mistakes_are_kept_whole(tmp_path: Path) -> None:
+    mistakes = mistaken()
+    mistakes.write(tmp_path / "mistakes.npz")
+    again = Mistakes.read(tmp_path / "mistakes.npz")
+    assert len(again) == 60
+    for name, value in vars(mistakes).items():
+        np.testing.assert_array_equal(getattr(again, name), value)
+
+
+def test_an_ankle_that_was_put_on_the_other_one_is_so_for_others_too(poses: Floats) -> None:
+    samples = Transplanter(mistaken()).samples(poses, 400, np.random.default_rng(6))
+    assert (samples.present == 1).all()
+    # Of people in the mirror it is the left ankle.
+    ankles = np.array([R_ANKLE, L_ANKLE])
+    wrong = samples.doubt[:, ankles] > 0.5
+    assert (wrong.sum(1) == 1).all()
+    assert 0.3 < wrong[:, 0].mean() < 0.7
+    there = samples.points[:, ankles[::-1]]
+    np.testing.assert_allclose(samples.points[:, ankles][wrong], there[wrong], atol=1e-4)
+    right = np.ones_like(samples.present, bool)
+    right[:, ankles] = ~wrong
+    np.testing.assert_allclose(samples.points[right], samples.truth[right], atol=1e-4)
+
+
+def test_known_people_come_as_they_were_found_and_in_the_mirror() -> None:
+    mistakes = mistaken()
+    samples = mistakes.people(300, np.random.default_rng(8))
+    wrong = samples.doubt[:, [R_ANKLE, L_ANKLE]] > 0.5
+    assert (wrong.sum(1) == 1).all()
+    assert 0.3 < wrong[:, 0].mean() < 0.7
+    heights = np.ptp(mistakes.joints_mm[..., 1], axis=1)
+    found = np.ptp(samples.truth[..., 1], axis=1) * samples.root_mm
+    assert heights.min() * 0.7 < np.median(found) < heights.max() * 1.3
+
+
+def test_joints_that_hardly_anything_says_are_missing() -> None:
+    mistakes = mistaken()
+    mistakes.confidence[:, R_ANKLE] = 0.1
+    samples = Transplanter(mistakes).samples(mistakes.joints_mm, 50, np.random.default_rng(1))
+    missing = samples.present == 0
+    assert (missing.sum(1) == 1).all()
+    assert (samples.points[missing] == 0).all()
+    assert (samples.doubt[missing] == 0).all()
+
+
+def test_a_network_s_joints_are_kept_beside_the_truth(tmp_path: Path) -> None:
+    folder = rendered(tmp_path)
+    mistakes = find([folder], PoseEstimator("cpm"), np.random.default_rng(0))
+    assert len(mistakes) == len(list(RENDERS.glob("*.jpg")))
+    truth = mistakes.joints_mm[..., :2] / mistakes.joints_mm[..., 2:]
+    np.testing.assert_allclose(mistakes.truth, truth, atol=0.01)
+    radius = np.sqrt(((truth - truth.mean(1, keepdims=True)) ** 2).sum(2).mean(1))
+    off = np.linalg.norm(mistakes.found - mistakes.truth, axis=2) / radius[:, None]
+    assert np.median(off) < 0.15
+    sure = mistakes.confidence > 0.8
+    assert off[sure].mean() < off[~sure].mean()
+
+
+def test_sets_without_the_truth_in_3d_are_refused(tmp_path: Path) -> None:
+    folder = rendered(tmp_path, truth=False)
+    with pytest.raises(AnnotationError, match="no 3D truth"):
+        find([folder], PoseEstimator("cpm"), np.random.default_rng(0))
