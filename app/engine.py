@@ -51,7 +51,7 @@ class Engine:
     def networks(self) -> tuple[PoseEstimator | PersonDetector | PoseLifter, ...]:
         """All networks in service."""
         served = (self.estimator, self.detector)
-        return served if self.lifter is None else (*served, self.lifter)
+        return served if self.lifter is None else (*served, *self.lifter.networks)
 
 
 def locate_library(settings: Settings, progress: Progress | None = None) -> Path:

@@ -34,7 +34,8 @@ def network_of(card: str, library: Library) -> PoseLifter | None:
     network = PoseLifter(path.stem, weights_dir=path.parent)
     prior = library.manifest.build.get("prior")
     own = prior["sha256"] if isinstance(prior, dict) else None
-    if own is not None and own != network.card.measured.get("prior_sha256"):
+    known = {each.card.measured.get("prior_sha256") for each in network.networks}
+    if own is not None and known != {own}:
         raise SystemExit(
             f"{path} learned from another prior than library {library.manifest.name}: name the "
             "network that goes with it (--network CARD), or measure without one (--network off)"

@@ -94,7 +94,10 @@ class LiftOutput(_Frozen):
     kind: Literal["lift"]
     joint_names: list[str]
     reads_confidence: bool = Field(
-        False, description="beside each joint it takes how probably it is right, not only whether"
+        False, description="takes how probably each joint is right, not only whether it is there"
+    )
+    found: str | None = Field(
+        None, description="name of the card of the network for joints that are not all sure"
     )
 
     @property

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from library_store.skeleton import LSP14
-from models.card import WEIGHTS_DIR, LiftOutput, ModelCard
+from models.card import WEIGHTS_DIR, LiftOutput, ModelCard, read_card
 from models.errors import ModelError
 from models.providers import Runtime
 from models.session import OnnxModel
@@ -38,8 +38,23 @@ class LearnedPose:
     covariance: Floats
 
 
+def lifter_names(name: str, weights_dir: Path = WEIGHTS_DIR) -> tuple[str, ...]:
+    """``name`` and the network for found joints that its card names, if it can be read."""
+    try:
+        output = read_card(weights_dir / f"{name}.json").output
+    except ModelError:
+        return (name,)
+    found = output.found if isinstance(output, LiftOutput) else None
+    return (name,) if found is None else (name, found)
+
+
 class PoseLifter:
-    """The lifting network with its card. Thread-safe; always on the CPU, where it takes a blink."""
+    """The lifting network with its card. Thread-safe; always on the CPU, where it takes a blink.
+
+    Joints that are stated are noisy at worst, those that a pose network found are now and then
+    elsewhere: what is best to make of the one is not of the other. So a card may name a second
+    network, ``found``, for people not all of whose joints are sure.
+    """
 
     def __init__(self, name: str = "lifter", *, weights_dir: Path = WEIGHTS_DIR) -> None:
         self._model = OnnxModel(weights_dir, name, provider="cpu")
@@ -49,11 +64,23 @@ class PoseLifter:
         if tuple(output.joint_names) != LSP14.joint_names:
             raise ModelError(f"model {name} has other joints than lsp14: {output.joint_names}")
         self._reads_confidence = output.reads_confidence
+        self._found: PoseLifter | None = None
+        if output.found is not None:
+            if len(lifter_names(output.found, weights_dir)) > 1:
+                raise ModelError(
+                    f"model {name} names {output.found} for found joints, which names a further one"
+                )
+            self._found = PoseLifter(output.found, weights_dir=weights_dir)
 
     @property
     def card(self) -> ModelCard:
         """The network's model card."""
         return self._model.card
+
+    @property
+    def networks(self) -> tuple[PoseLifter, ...]:
+        """Itself, and the network for joints that were found if there is one."""
+        return (self,) if self._found is None else (self, *self._found.networks)
 
     @property
     def runtime(self) -> Runtime:
@@ -69,6 +96,8 @@ class PoseLifter:
                 joints at least.
 
         """
+        if self._found is not None and ((confidence > 0) & (confidence < 1)).any():
+            return self._found.lift(points, confidence)
         seen = (confidence > 0)[:, None]
         joints = np.empty((1, LSP14.n_joints, 3), np.float32)
         joints[0, :, :2] = np.where(seen, points, 0.0)

@@ -34,6 +34,7 @@ from library_store.build import default_library_dir, verify_library
 from library_store.errors import LibraryError
 from models.card import read_card, read_weights
 from models.errors import ModelError
+from models.pose_lifter import lifter_names
 
 State = Literal["ok", "warning", "failure"]
 _COLOURS: dict[State, str] = {"ok": "green", "warning": "yellow", "failure": "red"}
@@ -242,7 +243,7 @@ def _networks(settings: Settings) -> Iterator[Finding]:
         yield Finding("networks", "failure", *_split(str(error)))
         return
     if settings.lifter != LIFTER_OFF:
-        names = (*names, settings.lifter)
+        names = (*names, *lifter_names(settings.lifter, settings.weights_dir))
     for name in names:
         yield _weights(settings.weights_dir, name)
 

@@ -21,6 +21,7 @@ from models.caffe import import_caffe as import_network
 from models.card import read_card, write_card
 from models.choice import cards_of
 from models.cost import cpu_ms
+from models.pose_lifter import lifter_names
 from models.session import OnnxModel
 
 commands = typer.Typer(
@@ -60,7 +61,7 @@ def print_card(
         else:
             output.print(_card_table(card))
         return
-    chosen = (*chosen_networks(settings), settings.lifter)
+    chosen = (*chosen_networks(settings), *lifter_names(settings.lifter, settings.weights_dir))
     cards = _all_cards(settings)
     if as_json:
         print_json(json.dumps([card.model_dump(mode="json") for card in cards]))

@@ -167,8 +167,13 @@ def lifter_card(
     measured: dict[str, float | str],
     *,
     mistaken: bool,
+    found: str | None = None,
 ) -> ModelCard:
-    """The card of a trained network; ``mistaken``: it has seen what a pose network mistakes."""
+    """The card of a trained network.
+
+    ``mistaken``: it has seen what a pose network mistakes; ``found``: the network that has, if this
+    one has not.
+    """
     layers = [p.numel() for p in network.parameters() if p.ndim == 2]
     return ModelCard(
         name=name,
@@ -180,7 +185,12 @@ def lifter_card(
         providers=("cpu",),
         parameters=sum(p.numel() for p in network.parameters()),
         multiply_adds=2 * sum(layers),
-        output=LiftOutput(kind="lift", joint_names=list(LSP14.joint_names), reads_confidence=True),
+        output=LiftOutput(
+            kind="lift",
+            joint_names=list(LSP14.joint_names),
+            reads_confidence=mistaken,
+            found=found,
+        ),
         training_data=[
             f"poses drawn from the pose prior {prior.card.name} {prior.card.version}, fitted on "
             "the CMU Graphics Lab Motion Capture Database (free for all uses), seen by made-up "
@@ -208,6 +218,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=RATE, help="of learning, at its highest")
     parser.add_argument("--init", type=Path, help="go on from this .onnx of an earlier run")
     parser.add_argument("--mistakes", type=Path, help="what models.training.lifter_mistakes wrote")
+    parser.add_argument("--found", help="name of the network for joints that are not all sure")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     prior = PosePrior.load(chosen.prior)
@@ -225,7 +236,13 @@ def main() -> None:
     if mistakes is not None:
         measured["people_with_mistakes"] = float(len(mistakes))
     card = lifter_card(
-        network, chosen.name, chosen.version, prior, measured, mistaken=mistakes is not None
+        network,
+        chosen.name,
+        chosen.version,
+        prior,
+        measured,
+        mistaken=mistakes is not None,
+        found=chosen.found,
     )
     save(network, card, drawn, chosen.out)
 

@@ -36,7 +36,7 @@ def test_the_cards_that_ship_are_listed_and_the_served_ones_marked() -> None:
     names = {card["name"] for card in json.loads(result.stdout)}
     assert names == {path.stem for path in WEIGHTS_DIR.glob("*.json")}
     starred = [line for line in invoke("card").stdout.splitlines() if "*" in line]
-    assert len(starred) == 3, "one pose network, one person network and the lifter serve"
+    assert len(starred) == 4, "one pose network, one person network and both lifters serve"
 
 
 def test_one_card_says_what_it_learned_from_and_its_licence() -> None:

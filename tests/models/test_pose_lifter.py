@@ -11,7 +11,8 @@ from library_store.cameras import extrinsics, sample_cameras
 from library_store.prior import PosePrior
 from library_store.skeleton import L_HIP, L_WRIST, LSP14, R_HIP
 from models import ModelError, PersonDetector, PoseLifter
-from models.card import WEIGHTS_DIR, read_card
+from models.card import WEIGHTS_DIR, read_card, write_card
+from models.pose_lifter import lifter_names
 
 Floats = NDArray[np.float64]
 EVERYBODY = np.ones(14)
@@ -103,6 +104,60 @@ def test_covariances_are_covariances(lifter: PoseLifter, seen: Floats) -> None:
         np.testing.assert_allclose(covariance, covariance.T, rtol=1e-5)
         scale = np.sqrt(np.diag(covariance))
         assert np.linalg.eigvalsh(covariance / np.outer(scale, scale)).min() > -1e-5
+
+
+def test_joints_that_are_not_all_sure_are_another_network_s(
+    lifter: PoseLifter, seen: Floats
+) -> None:
+    stated, found = lifter.networks
+    assert not stated.card.output.model_dump()["reads_confidence"]
+    assert found.card.output.model_dump()["reads_confidence"]
+    unsure = EVERYBODY.copy()
+    unsure[L_WRIST] = 0.4
+    points = image(seen)[0]
+    for confidence, network in ((EVERYBODY, stated), (unsure, found)):
+        own = PoseLifter(network.card.name).lift(points, confidence)
+        np.testing.assert_array_equal(lifter.lift(points, confidence).depths, own.depths)
+    missing = EVERYBODY.copy()
+    missing[L_WRIST] = 0.0
+    assert not np.array_equal(
+        lifter.lift(points, missing).depths, found.lift(points, missing).depths
+    )
+
+
+def test_doubt_in_a_joint_makes_it_less_sure_and_lets_it_go(seen: Floats) -> None:
+    found = PoseLifter("lifter-found")
+    ratios, moves = [], []
+    for points in image(seen)[:20]:
+        radius = np.sqrt(((points - points.mean(0)) ** 2).sum(1).mean())
+        astray = points.copy()
+        astray[L_WRIST] += 0.5 * radius
+        unsure = np.full(14, 0.95)
+        sure = found.lift(astray, unsure)
+        unsure[L_WRIST] = 0.25
+        doubted = found.lift(astray, unsure)
+        variances = [np.diag(pose.covariance)[2 * L_WRIST] for pose in (doubted, sure)]
+        ratios.append(variances[0] / variances[1])
+        off = [np.linalg.norm(p.points[L_WRIST] - points[L_WRIST]) for p in (doubted, sure)]
+        moves.append(off[0] / off[1])
+    assert np.median(ratios) > 1.5
+    assert np.median(moves) < 0.85
+
+
+def test_a_network_for_found_joints_may_not_name_a_further_one(tmp_path: Path) -> None:
+    for name in ("lifter", "lifter-found"):
+        for suffix in (".onnx", ".json"):
+            shutil.copy(WEIGHTS_DIR / f"{name}{suffix}", tmp_path)
+    card = read_card(tmp_path / "lifter-found.json")
+    output = card.output.model_copy(update={"found": "lifter"})
+    write_card(tmp_path / "lifter-found.json", card.model_copy(update={"output": output}))
+    with pytest.raises(ModelError, match="names a further one"):
+        PoseLifter(weights_dir=tmp_path)
+    (tmp_path / "lifter-found.json").unlink()
+    with pytest.raises(ModelError, match=r"lifter-found\.json is missing"):
+        PoseLifter(weights_dir=tmp_path)
+    assert lifter_names("lifter", tmp_path) == ("lifter", "lifter-found")
+    assert lifter_names("nobody", tmp_path) == ("nobody",)
 
 
 def test_other_networks_are_no_lifters_and_it_is_none_of_theirs() -> None:

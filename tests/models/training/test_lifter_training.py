@@ -47,7 +47,7 @@ def doubted(samples: Samples) -> Samples:
 
 def written(network: PoseMlp, poses: Floats, folder: Path) -> PoseLifter:
     """The network as the service runs it."""
-    card = train_lifter.lifter_card(network, "tiny", "1", PosePrior.load(), {}, mistaken=False)
+    card = train_lifter.lifter_card(network, "tiny", "1", PosePrior.load(), {}, mistaken=True)
     train_lifter.save(network, card, train_lifter.drawing(poses, None), folder)
     return PoseLifter("tiny", weights_dir=folder)
 
