@@ -66,6 +66,6 @@ FUSION_SIGMA = SigmaCalibration(
         1.211, 0.678, 1.107, 1.111, 0.677, 1.061, 1.083,
     ),
     noise_mm_per_px=4.0,
-    person_doubt_mm=700.0,
-    joint_doubt_mm=500.0,
+    person_doubt_mm=600.0,
+    joint_doubt_mm=400.0,
 )  # fmt: skip
