@@ -23,7 +23,8 @@ def test_info(server: Server) -> None:
     assert len(info.model.sha256) == 64
     assert info.limits.max_body_bytes == 2_000_000
     assert info.licences
-    assert [network.kind for network in info.networks] == ["pose", "people", "lift"]
+    assert [network.kind for network in info.networks] == ["pose", "people", "lift", "lift"]
+    assert len({network.name for network in info.networks}) == 4
     assert info.networks[2].input_px is None
 
 
