@@ -43,6 +43,19 @@ def test_one_person_seen_by_two_cells_is_found_once_and_neighbours_stay_two() ->
     assert len(decode(neighbours, 8, UNIT, 0.3)[0]) == 2
 
 
+@pytest.mark.parametrize(
+    ("weak", "apart", "sure", "people"),
+    [(-0.3, 5, 2.0, 1), (0.0, 5, 2.0, 2), (-0.3, 9, 2.0, 2), (-0.3, 5, 0.5, 2)],
+    ids=["weak", "likely", "elsewhere", "beside nobody sure"],
+)
+def test_a_weak_box_that_lies_within_a_sure_one_adds_nobody(
+    weak: float, apart: int, sure: float, people: int
+) -> None:
+    # Side by side: of boxes 80 px wide, 5 cells apart, half lies within the other; 9, a tenth.
+    maps = maps_with([(10, 12, 40.0, sure), (10 + apart, 12, 40.0, weak)])
+    assert len(decode(maps, 8, UNIT, 0.35)[0]) == people
+
+
 def test_best_first() -> None:
     _, scores = decode(maps_with([(5, 5, 8.0, 0.0), (20, 20, 8.0, 2.0)]), 8, UNIT, 0.3)
     assert scores[0] > scores[1]
