@@ -1,7 +1,9 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from library_store.skeleton import LSP14
 from models.heatmaps import Joints2D
 from models.person_detector import PersonBox
 from models.presence import present
@@ -30,6 +32,21 @@ def test_distinct_people_stay_in_order() -> None:
 
 def test_the_same_pose_twice_is_one_person() -> None:
     assert kept([person(), person(3), person(80)]) == [0, 2]
+
+
+@pytest.mark.parametrize("exchanged", [False, True])
+def test_somebody_else_s_head_and_arms_are_no_second_person(exchanged: bool) -> None:
+    """A box about the upper body alone, whose legs are put anywhere."""
+    first = person()
+    positions, confidence = first.positions_px.copy(), np.full(14, 0.9)
+    if exchanged:
+        positions = positions[list(LSP14.mirror)]
+    positions[8:] += np.array([300.0, 0.0])
+    confidence[8:] = 0.3
+    second = replace(first, positions_px=positions, confidence=confidence)
+    assert kept([first, second]) == [0]
+    assert kept([second]) == [0]
+    assert kept([first, replace(second, confidence=np.full(14, 0.9))]) == [0, 1], "with sure legs"
 
 
 def test_somebody_cut_off_at_the_chest_is_somebody() -> None:
