@@ -132,7 +132,7 @@ def _with_mirror(shapes: Floats) -> Floats:
 def find(renders: list[Path], estimator: PoseEstimator, rng: np.random.Generator) -> Mistakes:
     """Have a network find the people of rendered sets, by boxes about as good as a detector's.
 
-    Raises ``AnnotationError`` for sets without the truth in 3D.
+    Raises ``AnnotationError`` for sets without the truth in 3D, and when nobody is found.
     """
     rows: list[tuple[NDArray[np.float64], ...]] = []
     for path in renders:
@@ -153,6 +153,8 @@ def find(renders: list[Path], estimator: PoseEstimator, rng: np.random.Generator
             centre, focal = np.array(record["principal_point_px"]), record["focal_length_px"]
             normal = [(px - centre) / focal for px in (found.positions_px, truth_px)]
             rows.append((normal[0], found.belief, normal[1], np.array(record["joints_mm"])))
+    if not rows:
+        raise AnnotationError(f"nobody is found in {', '.join(str(path) for path in renders)}")
     return Mistakes(*(np.array(part, np.float32) for part in zip(*rows, strict=True)))
 
 

@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -113,4 +114,12 @@ def test_a_network_s_joints_are_kept_beside_the_truth(tmp_path: Path) -> None:
 def test_sets_without_the_truth_in_3d_are_refused(tmp_path: Path) -> None:
     folder = rendered(tmp_path, truth=False)
     with pytest.raises(AnnotationError, match="no 3D truth"):
+        find([folder], PoseEstimator("cpm"), np.random.default_rng(0))
+
+
+def test_sets_in_which_nobody_is_found_are_named(tmp_path: Path) -> None:
+    folder = rendered(tmp_path)
+    for picture in folder.glob("*.jpg"):
+        assert cv2.imwrite(str(picture), np.zeros((480, 640, 3), np.uint8))
+    with pytest.raises(AnnotationError, match="nobody is found"):
         find([folder], PoseEstimator("cpm"), np.random.default_rng(0))
