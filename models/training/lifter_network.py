@@ -68,6 +68,7 @@ class PoseMlp(nn.Module):
             for block in self.blocks:
                 block[1].weight.mul_(0.1)
                 nn.init.zeros_(block[1].bias)
+            self.first.weight[:, 3 * N + 1 :] = 0.0  # doubt is heeded once it is learned
             nn.init.zeros_(self.last.weight)
             nn.init.zeros_(self.last.bias)
             self.last.bias[_SIZE + 1 :] = -2.0

@@ -122,6 +122,8 @@ def test_training_goes_on_from_what_was_written(poses: Floats, tmp_path: Path) -
     features = train_lifter.tensors(doubted(draw(poses, 64, np.random.default_rng(1))))[0]
     with torch.no_grad():
         np.testing.assert_allclose(again(features), network(features), atol=0.05)
+    for name in ("lifter", "lifter-found"):
+        assert len(read_network(WEIGHTS_DIR / f"{name}.onnx").blocks) == 3
     with pytest.raises(ModelError, match="cannot be read as a lifter"):
         read_network(WEIGHTS_DIR / "person.onnx")
 
