@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import cv2
 import numpy as np
@@ -66,9 +67,12 @@ class Mistakes:
 
     @staticmethod
     def read(path: Path) -> Mistakes:
-        """What ``write`` wrote."""
-        with np.load(path, allow_pickle=False) as data:
-            return Mistakes(*(data[name] for name in Mistakes.__dataclass_fields__))
+        """What ``write`` wrote; ``AnnotationError`` for any other file."""
+        try:
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
+                return Mistakes(*(data[name] for name in Mistakes.__dataclass_fields__))
+        except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
+            raise AnnotationError(f"{path} is not what lifter_mistakes wrote: {error}") from error
 
     def people(self, n: int, rng: np.random.Generator) -> Samples:
         """``n`` of these people themselves, half of them in the mirror."""

@@ -62,6 +62,15 @@ def test_mistakes_are_kept_whole(tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(again, name), value)
 
 
+def test_other_files_hold_no_mistakes(tmp_path: Path) -> None:
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    np.savez(tmp_path / "other.npz", found=np.zeros(3))
+    (tmp_path / "cut.npz").write_bytes((tmp_path / "other.npz").read_bytes()[:100])
+    for name in ("array.npy", "other.npz", "cut.npz", "missing.npz"):
+        with pytest.raises(AnnotationError, match=f"{name} is not what lifter_mistakes wrote"):
+            Mistakes.read(tmp_path / name)
+
+
 def test_an_ankle_that_was_put_on_the_other_one_is_so_for_others_too(poses: Floats) -> None:
     samples = Transplanter(mistaken()).samples(poses, 400, np.random.default_rng(6))
     assert (samples.present == 1).all()
