@@ -46,6 +46,9 @@ class PoseOutput(_Frozen):
     target_sigma_cells: float = Field(ge=0, description="blur of the training targets")
     maps: Literal["logits", "beliefs"]
     border_grey: int = Field(0, ge=0, le=255, description="what crops have beyond the photo's edge")
+    depths: bool = Field(
+        False, description="then maps of the joints' depths less the hips', over the crop's side"
+    )
     looks: Literal[1, 2, 3] = Field(1, description="how often a doubtful crop is looked at")
     confidence: ConfidenceCalibration | None = None
     spread: SpreadCalibration | None = None
@@ -54,6 +57,12 @@ class PoseOutput(_Frozen):
     def _looks_add_logits(self) -> Self:
         if self.looks > 1 and self.maps != "logits":
             raise ValueError(f"looks are averaged as logits: looks {self.looks} needs maps logits")
+        return self
+
+    @model_validator(mode="after")
+    def _depths_go_with_logits(self) -> Self:
+        if self.depths and self.maps != "logits":
+            raise ValueError(f"depths are read beside logits, not beside {self.maps}")
         return self
 
     @model_validator(mode="after")
@@ -66,6 +75,11 @@ class PoseOutput(_Frozen):
         if self.spread is not None and len(self.spread.factor) != n:
             raise ValueError(f"spread needs a factor for each of {n} joints")
         return self
+
+    @property
+    def n_maps(self) -> int:
+        """The joints' maps, the background's, and the joints' depths if there are any."""
+        return (2 if self.depths else 1) * len(self.joint_names) + 1
 
     @property
     def side_px(self) -> int:
@@ -96,9 +110,23 @@ class LiftOutput(_Frozen):
     reads_confidence: bool = Field(
         False, description="takes how probably each joint is right, not only whether it is there"
     )
+    reads_depths: bool = Field(
+        False, description="takes depths that a pose network read off the picture"
+    )
     found: str | None = Field(
         None, description="name of the card of the network for joints that are not all sure"
     )
+
+    @model_validator(mode="after")
+    def _depths_come_from_a_network(self) -> Self:
+        if self.reads_depths and not self.reads_confidence:
+            raise ValueError("only a network that reads confidence reads depths")
+        return self
+
+    @property
+    def n_columns(self) -> int:
+        """What it takes of a joint: x, y and whether it is there, the depth and whether known."""
+        return 5 if self.reads_depths else 3
 
     @property
     def side_px(self) -> None:

@@ -35,7 +35,7 @@ def cpu_ms(model: OnnxModel, runs: int = 60) -> float:
         photo = rng.integers(0, 256, (480, 640, 3)).astype(np.uint8)
         batch = shrunk(photo, output.long_side_px)[0][None]
     else:
-        batch = made_up_joints(1, len(output.joint_names))
+        batch = made_up_joints(1, output)
     spent_s = []
     for _ in range(WARM_UP_RUNS + runs):
         started_s = time.process_time()

@@ -2,8 +2,8 @@
 
 Networks confuse left and right, and more so on people who bend, lie or fall. The first look tells
 which way up the trunk is; the others see the person upright, in the mirror and smaller, where the
-same mistake is seldom made again. The looks' logits are averaged, in the first one's frame. Who is
-seen clearly by now is not looked at again.
+same mistake is seldom made again. The looks' logits are averaged, in the first one's frame, and so
+are the maps of depths if the network makes any. Who is seen clearly by now is not looked at again.
 """
 
 from __future__ import annotations
@@ -44,14 +44,16 @@ FURTHER = (
 )
 """Who is spared a look would gain next to nothing by it (docs/training.md). The third sees the
 corners of a turned crop too."""
-MIRROR = (*LSP14.mirror, LSP14.n_joints)
-"""Maps of the mirrored person, the background's last."""
+N_BELIEFS = LSP14.n_joints + 1
+"""Maps of joints and background; those after them are the joints' depths."""
+MIRROR = (*LSP14.mirror, LSP14.n_joints, *(N_BELIEFS + joint for joint in LSP14.mirror))
+"""Maps of the mirrored person; without depths the first ``N_BELIEFS``."""
 MOST_CHANNELS = 4
 """OpenCV warps that many at once with a constant border."""
 
 
 def leans(maps: Maps) -> Floats:
-    """Angle (N,) rad, clockwise as seen, by which each trunk leans, from (N, 15, h, w) maps."""
+    """Angle (N,) rad, clockwise as seen, by which each trunk leans, from (N, C, h, w) maps."""
     width = maps.shape[-1]
     trunk = maps[:, (R_SHOULDER, L_SHOULDER, R_HIP, L_HIP)]
     best = trunk.reshape(*trunk.shape[:2], -1).argmax(-1)
@@ -89,7 +91,7 @@ def _warped(planes: Maps, matrix: Floats) -> Maps:
 
 
 def belief(maps: Maps) -> NDArray[np.float32]:
-    """How far logits (N, 15, h, w) believe in all joints: mean over their strongest cells (N,)."""
+    """How far logits (N, C, h, w) believe in all joints: mean over their strongest cells (N,)."""
     strongest = maps[:, : LSP14.n_joints].reshape(len(maps), LSP14.n_joints, -1).max(-1)
     mean: NDArray[np.float32] = (1 / (1 + np.exp(-np.clip(strongest, -30, 30)))).mean(1)
     return mean
@@ -101,9 +103,11 @@ def usual(looks: int) -> float:
 
 
 def looked_at(run: Callable[[Images], Maps], images: Images, looks: int) -> Maps:
-    """Logits (N, 15, h, w) of crops (N, S, S, 3) by the network ``run``, after up to ``looks``.
+    """Maps (N, C, h, w) of crops (N, S, S, 3) by the network ``run``, after up to ``looks``.
 
-    Cells that a further look does not see keep what the earlier ones say.
+    C is 15, logits, or 29 with maps of depths, which are shares of the crop's side: what is smaller
+    by a look's zoom is so in depth too. Cells that a further look does not see keep what the
+    earlier ones say.
     """
     maps = run(images)
     size, cells = images.shape[1], maps.shape[-1]
@@ -118,13 +122,14 @@ def looked_at(run: Callable[[Images], Maps], images: Images, looks: int) -> Maps
         ]
         seen = run(np.asarray(turned, np.uint8))
         if look.mirrored:
-            seen = seen[:, MIRROR]
+            seen = seen[:, MIRROR[: seen.shape[1]]]
         there = np.stack(
             [
                 _warped(planes, upright(look, angle, cells))
                 for planes, angle in zip(seen, lean, strict=True)
             ]
         )
+        there[:, N_BELIEFS:] /= look.zoom
         mean = (before * maps[again] + there) / (before + 1)
         maps = maps.copy()
         maps[again] = np.where(np.isnan(there), maps[again], mean)

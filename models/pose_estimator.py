@@ -80,7 +80,7 @@ class PoseEstimator:
         scales: Sequence[float],
         origins: Sequence[tuple[float, float]],
     ) -> list[Joints2D]:
-        """Joints from the network's (N, 15, h, w) maps of people in one photo.
+        """Joints from the network's maps (N, ``n_maps`` of its card, h, w) of people in one photo.
 
         A crop's pixel lies in the photo at origin + scale * pixel.
         """
@@ -98,11 +98,14 @@ class PoseEstimator:
         covariance_px2 = read.covariance * (scale * out.stride_px)[:, None, None, None] ** 2
         confidence: Floats | None = None
         sigma: Floats | None = None
+        depths: Floats | None = None
         if out.confidence is not None:
             confidence = calibrated(read.features, np.asarray(out.confidence.coefficients))
         if out.spread is not None:
             deviation = np.sqrt(np.trace(covariance_px2, axis1=-2, axis2=-1))
             sigma = deviation * np.asarray(out.spread.factor)
+        if read.depths is not None:
+            depths = read.depths * (scale * out.input_px)[:, None]
         return [
             Joints2D(
                 positions_px=positions[i],
@@ -110,6 +113,7 @@ class PoseEstimator:
                 confidence=None if confidence is None else confidence[i],
                 sigma_px=None if sigma is None else sigma[i],
                 peak=read.peak[i],
+                depths_px=None if depths is None else depths[i],
             )
             for i in range(len(maps))
         ]

@@ -3,7 +3,8 @@
 A small residual MLP after Martinez et al. (ICCV 2017). It knows neither size nor distance: joints
 go in as the camera sees them and with how probably each is right, and out come, for each, where in
 the image it really is and how much nearer or farther than the hips, relative to the hips' own
-distance. The architecture is in
+distance. A network may also be told what the picture shows of that: joints alone leave it open
+whether a limb points to the camera or away. The architecture is in
 ``models.training.lifter_network``, what it is trained on in ``models.training.lifter_samples``.
 """
 
@@ -63,7 +64,7 @@ class PoseLifter:
             raise ModelError(f"model {name} is no lifter: its card says {output.kind}")
         if tuple(output.joint_names) != LSP14.joint_names:
             raise ModelError(f"model {name} has other joints than lsp14: {output.joint_names}")
-        self._reads_confidence = output.reads_confidence
+        self._output = output
         self._found: PoseLifter | None = None
         if output.found is not None:
             if len(lifter_names(output.found, weights_dir)) > 1:
@@ -87,21 +88,27 @@ class PoseLifter:
         """The provider in use and the precision it runs the network in."""
         return self._model.runtime
 
-    def lift(self, points: Floats, confidence: Floats) -> LearnedPose:
+    def lift(self, points: Floats, confidence: Floats, depths: Floats | None = None) -> LearnedPose:
         """Lift one person.
 
         Args:
             points: (14, 2) normalised image coordinates, the camera turned onto the person.
             confidence: (14,) how probably each is right; 0 = missing, whose point is ignored. Two
                 joints at least.
+            depths: (14,) relative to the hip midpoint's, ``z / z_root - 1``, as the picture shows
+                them, or None when unknown. Those of missing joints are ignored, and all of them by
+                networks that do not read them.
 
         """
         if self._found is not None and ((confidence > 0) & (confidence < 1)).any():
-            return self._found.lift(points, confidence)
-        seen = (confidence > 0)[:, None]
-        joints = np.empty((1, LSP14.n_joints, 3), np.float32)
-        joints[0, :, :2] = np.where(seen, points, 0.0)
-        joints[0, :, 2:] = confidence[:, None] if self._reads_confidence else seen
+            return self._found.lift(points, confidence, depths)
+        seen = confidence > 0
+        joints = np.zeros((1, LSP14.n_joints, self._output.n_columns), np.float32)
+        joints[0, seen, :2] = points[seen]
+        joints[0, :, 2] = confidence if self._output.reads_confidence else seen
+        if depths is not None and self._output.reads_depths:
+            joints[0, seen, 3] = depths[seen]
+            joints[0, seen, 4] = 1.0
         answer = self._model.run(joints)[0].astype(np.float64)
         n = 2 * LSP14.n_joints
         return LearnedPose(answer[0, :n].reshape(-1, 2), answer[0, n:], answer[1:])

@@ -16,7 +16,14 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from models.card import DetectorOutput, ModelCard, PoseOutput, read_card, read_weights
+from models.card import (
+    DetectorOutput,
+    LiftOutput,
+    ModelCard,
+    PoseOutput,
+    read_card,
+    read_weights,
+)
 from models.errors import ModelError
 from models.providers import (
     ProviderChoice,
@@ -82,7 +89,7 @@ class OnnxModel:
     def run(self, batch: NDArray[Any]) -> NDArray[np.float32]:
         """What the network makes of a batch, float32.
 
-        Of (N, H, W, 3) uint8 BGR its maps (N, C, h, w); of joints (N, 14, 3), see
+        Of (N, H, W, 3) uint8 BGR its maps (N, C, h, w); of joints (N, 14, 3 or 5), see
         ``models.pose_lifter``, their answer (N, rows, columns).
         """
         answer: NDArray[np.float32] = self._session.run(None, {self._input: batch})[0]
@@ -140,34 +147,37 @@ def _probe(card: ModelCard) -> _Probe:
     if isinstance(output, PoseOutput | DetectorOutput):
         if isinstance(output, PoseOutput):
             height = width = output.input_px
-            channels = len(output.joint_names) + 1
+            channels, meaning = output.n_maps, "joints and background"
+            if output.depths:
+                meaning = "joints, background and the joints' depths"
         else:
-            (height, width), channels = PROBE_PX, 5
+            (height, width), channels, meaning = PROBE_PX, 5, "person and box"
         return _Probe(
             batch=np.zeros((2, height, width, 3), np.uint8),
             kind="tensor(uint8)",
             answer=(channels, int(height / output.stride_px), int(width / output.stride_px)),
             wanted="one uint8 image input (N, H, W, 3)",
             given=f"two images of {width}x{height} px",
-            meaning="joints and background or box, input over stride_px",
+            meaning=f"{meaning}, input over stride_px",
             of_nothing="maps of a black image",
         )
     joints = len(output.joint_names)
     return _Probe(
-        batch=made_up_joints(2, joints),
+        batch=made_up_joints(2, output),
         kind="tensor(float)",
         answer=(1 + 3 * joints, 3 * joints),
-        wanted="one float input of joints (N, J, 3)",
-        given=f"two people of {joints} joints",
+        wanted=f"one float input of joints (N, J, {output.n_columns})",
+        given=f"two people of {joints} joints" + (" and depths" if output.reads_depths else ""),
         meaning="a state and the covariance of its errors",
         of_nothing="answer for made-up joints",
     )
 
 
-def made_up_joints(n: int, joints: int) -> NDArray[np.float32]:
-    """(n, joints, 3) such as a lifting network takes: anywhere, all of them present."""
-    batch = np.random.default_rng(0).random((n, joints, 3), np.float32)
-    batch[..., 2] = 1.0
+def made_up_joints(n: int, output: LiftOutput) -> NDArray[np.float32]:
+    """Joints of ``n`` people as a lifting network takes them: anywhere, all present and known."""
+    shape = (n, len(output.joint_names), output.n_columns)
+    batch = np.random.default_rng(0).random(shape, np.float32)
+    batch[..., 2::2] = 1.0
     return batch
 
 

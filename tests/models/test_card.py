@@ -8,7 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from models.card import WEIGHTS_DIR, read_card, read_weights, write_card, write_network
+from models.card import (
+    WEIGHTS_DIR,
+    LiftOutput,
+    PoseOutput,
+    read_card,
+    read_weights,
+    write_card,
+    write_network,
+)
 
 
 @contextmanager
@@ -42,3 +50,21 @@ def test_a_full_disk_leaves_the_old_network_and_nothing_else(tmp_path: Path, siz
     assert read_card(tmp_path / "person.json") == card
     assert read_weights(tmp_path / card.file, card) == b"old"
     assert {path.name for path in tmp_path.iterdir()} == {"person.json", card.file}
+
+
+def test_depths_are_read_beside_logits_only() -> None:
+    output = read_card(WEIGHTS_DIR / "cpm.json").output.model_dump()
+    assert not output["depths"]
+    assert PoseOutput.model_validate(output).n_maps == 15
+    assert PoseOutput.model_validate(output | {"depths": True}).n_maps == 29
+    with pytest.raises(ValueError, match="beside logits, not beside beliefs"):
+        PoseOutput.model_validate(output | {"depths": True, "maps": "beliefs", "looks": 1})
+
+
+def test_depths_are_of_joints_that_were_found() -> None:
+    output = read_card(WEIGHTS_DIR / "lifter-found.json").output.model_dump()
+    assert not output["reads_depths"]
+    assert LiftOutput.model_validate(output).n_columns == 3
+    assert LiftOutput.model_validate(output | {"reads_depths": True}).n_columns == 5
+    with pytest.raises(ValueError, match="only a network that reads confidence"):
+        LiftOutput.model_validate(output | {"reads_depths": True, "reads_confidence": False})

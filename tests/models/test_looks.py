@@ -78,6 +78,56 @@ def test_looks_that_agree_change_nothing(angle_deg: float, looks: int) -> None:
     np.testing.assert_allclose(found[0], joints, atol=0.15)
 
 
+def depth_maps(joints_depth: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float32]:
+    """(1, 14, CELLS, CELLS) of depths at places (CELLS, CELLS, 2): the deeper the further down."""
+    slope = 0.002 * (at - CELLS / 2) @ np.array([0.5, 1.0])
+    maps: NDArray[np.float32] = (joints_depth[:, None, None] + slope)[None].astype(np.float32)
+    return maps
+
+
+@pytest.mark.parametrize("looks", [2, 3])
+@pytest.mark.parametrize("angle_deg", [0, 30, -75, 140, 180])
+def test_every_look_says_the_same_of_depths(angle_deg: float, looks: int) -> None:
+    """What is small in a look is shallow in it; the mirror exchanges names, not depths."""
+    joints = leaning(angle_deg)
+    depths = np.random.default_rng(2).uniform(-0.3, 0.3, 14)
+    cells = np.stack(np.meshgrid(np.arange(CELLS), np.arange(CELLS)), -1).astype(np.float64)
+    first = np.concatenate([gaussians(joints), depth_maps(depths, cells)], 1)
+    views: list[NDArray[np.uint8]] = []
+
+    def run(images: NDArray[np.uint8]) -> NDArray[np.float32]:
+        views.append(images)
+        if len(views) == 1:
+            return first
+        look = FURTHER[len(views) - 2]
+        matrix = upright(look, leans(first)[0], CELLS)
+        seen = joints @ matrix[:, :2].T + matrix[:, 2]
+        from_there = (cells - matrix[:, 2]) @ np.linalg.inv(matrix[:, :2]).T
+        names = list(LSP14.mirror) if look.mirrored else slice(None)
+        deep = look.zoom * depth_maps(depths[names], from_there)
+        return np.concatenate([gaussians(seen[names]), deep], 1)
+
+    image = np.random.default_rng(0).integers(0, 255, (1, SIZE, SIZE, 3)).astype(np.uint8)
+    mean = looked_at(run, image, looks)
+    assert len(views) == looks
+    np.testing.assert_allclose(mean[:, 15:], first[:, 15:], atol=0.005)
+
+
+def test_maps_of_depths_leave_the_others_as_they_are() -> None:
+    rng = np.random.default_rng(3)
+    seen = [
+        np.concatenate([gaussians(leaning(20)), rng.normal(size=(1, 14, CELLS, CELLS))], 1).astype(
+            np.float32
+        )
+        for _ in range(3)
+    ]
+    image = np.zeros((1, SIZE, SIZE, 3), np.uint8)
+    with_depths, without = iter(seen), iter([maps[:, :15] for maps in seen])
+    both = looked_at(lambda _: next(with_depths), image, 3)
+    np.testing.assert_array_equal(both[:, :15], looked_at(lambda _: next(without), image, 3))
+    assert next(with_depths, None) is None
+
+
 def test_one_look_is_the_network_itself() -> None:
     maps = gaussians(leaning(20))
     seen = looked_at(lambda _: maps, np.zeros((1, SIZE, SIZE, 3), np.uint8), 1)

@@ -13,6 +13,7 @@ from library_store.skeleton import L_HIP, L_WRIST, LSP14, R_HIP
 from models import ModelError, PersonDetector, PoseLifter
 from models.card import WEIGHTS_DIR, read_card, write_card
 from models.pose_lifter import lifter_names
+from tests.models import tiny_onnx
 
 Floats = NDArray[np.float64]
 EVERYBODY = np.ones(14)
@@ -142,6 +143,53 @@ def test_doubt_in_a_joint_makes_it_less_sure_and_lets_it_go(seen: Floats) -> Non
         moves.append(off[0] / off[1])
     assert np.median(ratios) > 1.5
     assert np.median(moves) < 0.85
+
+
+@pytest.fixture
+def believing(tmp_path: Path) -> PoseLifter:
+    """The shipped network, and for found joints one that believes the depths it is told."""
+    for suffix in (".onnx", ".json"):
+        shutil.copy(WEIGHTS_DIR / f"lifter{suffix}", tmp_path)
+    card = read_card(tmp_path / "lifter.json")
+    output = card.output.model_copy(update={"found": "deep"})
+    write_card(tmp_path / "lifter.json", card.model_copy(update={"output": output}))
+    deep = tiny_onnx.lift_output(reads_confidence=True, reads_depths=True)
+    tiny_onnx.write(tmp_path, "deep", tiny_onnx.believer(5, 0.1), output=deep)
+    tiny_onnx.write(tmp_path, "known", tiny_onnx.believer(5, 0.1, depths_from=4), output=deep)
+    tiny_onnx.write(tmp_path, "sure", tiny_onnx.believer(5, 0.1, depths_from=2), output=deep)
+    return PoseLifter(weights_dir=tmp_path)
+
+
+def test_depths_reach_the_network_that_reads_them(
+    believing: PoseLifter, tmp_path: Path, seen: Floats
+) -> None:
+    points, depths = image(seen)[0], true_depths(seen)[0]
+    unsure = np.linspace(0.3, 1.0, 14)
+    unsure[L_WRIST] = 0.0
+    hidden = depths.copy()
+    hidden[L_WRIST] = np.nan
+    told = np.where(unsure > 0, depths, 0.0)
+    known, sure = (PoseLifter(name, weights_dir=tmp_path) for name in ("known", "sure"))
+    for given_depths, expected in ((depths, told), (hidden, told), (None, 0 * told)):
+        pose = believing.lift(points, unsure, given_depths)
+        np.testing.assert_allclose(pose.depths, expected, atol=1e-7)
+        np.testing.assert_allclose(pose.points[unsure > 0], points[unsure > 0], atol=1e-7)
+        of_known = known.lift(points, unsure, given_depths).depths
+        np.testing.assert_array_equal(of_known, (unsure > 0) & (given_depths is not None))
+        of_sure = sure.lift(points, unsure, given_depths).depths
+        np.testing.assert_allclose(of_sure, unsure, atol=1e-7)
+
+
+def test_who_does_not_read_depths_is_not_told(
+    lifter: PoseLifter, believing: PoseLifter, seen: Floats
+) -> None:
+    unsure = np.full(14, 0.8)
+    for points, depths in zip(image(seen)[:3], true_depths(seen), strict=False):
+        for network, confidence in ((lifter, EVERYBODY), (lifter, unsure), (believing, EVERYBODY)):
+            told, untold = (network.lift(points, confidence, d) for d in (depths, None))
+            np.testing.assert_array_equal(told.points, untold.points)
+            np.testing.assert_array_equal(told.depths, untold.depths)
+            np.testing.assert_array_equal(told.covariance, untold.covariance)
 
 
 def test_a_network_for_found_joints_may_not_name_a_further_one(tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from models import ModelError, PersonDetector, PoseEstimator
-from models.card import WEIGHTS_DIR, read_card
+from models.card import WEIGHTS_DIR, LiftOutput, read_card
 from models.choice import choose
-from models.session import OnnxModel
+from models.session import OnnxModel, made_up_joints
 from tests.cuda import claim_cuda
 from tests.models import tiny_onnx
 from tests.models.tiny_onnx import FLOAT16, node, planes
@@ -161,6 +161,60 @@ def test_foreign_networks_are_refused_with_a_reason_and_a_mend(
         OnnxModel(tmp_path, "tiny")
     assert str(tmp_path / "tiny.onnx") in str(refusal.value)
     assert "posematch model export" in str(refusal.value)
+
+
+def test_maps_of_depths_are_there_if_the_card_says_so_and_only_then(
+    tmp_path: Path, weights: Path
+) -> None:
+    card = json.loads((weights / "cpm.json").read_text())
+    card["output"]["depths"] = True
+    (weights / "cpm.json").write_text(json.dumps(card))
+    said = r"maps of shape \(15, 40, 40\) instead of \(29, 40, 40\) \(joints, background and the"
+    with pytest.raises(ModelError, match=f"{said} joints' depths"):
+        PoseEstimator(weights_dir=weights)
+
+    more = node("ReduceMax", ["planes"], "most", axes=[1])
+    five = node("Concat", ["planes", "most", "most"], "five", axis=1)
+    deep = tiny_onnx.model(planes(more, five, last="five"))
+    output: Any = tiny_onnx.card("tiny", deep)["output"]
+    tiny_onnx.write(tmp_path, "tiny", deep, output=output | {"depths": True})
+    assert OnnxModel(tmp_path, "tiny").run(np.ones((1, 32, 32, 3), np.uint8)).shape[1] == 5
+    tiny_onnx.write(tmp_path, "tiny", deep)
+    with pytest.raises(ModelError, match=r"instead of \(3, 32, 32\) \(joints and background"):
+        OnnxModel(tmp_path, "tiny")
+
+
+@pytest.mark.parametrize("reads_depths", [False, True])
+def test_lifting_networks_are_told_of_depths_if_their_card_says_so(
+    tmp_path: Path, reads_depths: bool
+) -> None:
+    output = tiny_onnx.lift_output(reads_confidence=True, reads_depths=reads_depths)
+    right, wrong = (5, 3) if reads_depths else (3, 5)
+    tiny_onnx.write(tmp_path, "tiny", tiny_onnx.believer(right, 0.1, 2), output=output)
+    OnnxModel(tmp_path, "tiny")
+    tiny_onnx.write(tmp_path, "tiny", tiny_onnx.believer(wrong, 0.1, 2), output=output)
+    said = "14 joints and depths, as the card" if reads_depths else "14 joints, as the card"
+    with pytest.raises(ModelError, match=said):
+        OnnxModel(tmp_path, "tiny")
+    tiny_onnx.write(tmp_path, "tiny", (WEIGHTS_DIR / "cpm.onnx").read_bytes(), output=output)
+    with pytest.raises(ModelError, match=rf"one float input of joints \(N, J, {right}\)"):
+        OnnxModel(tmp_path, "tiny")
+
+
+def made_up_network(reads_depths: bool) -> LiftOutput:
+    return LiftOutput.model_validate(
+        tiny_onnx.lift_output(reads_confidence=True, reads_depths=reads_depths)
+    )
+
+
+def test_made_up_joints_are_all_there_and_their_depths_known() -> None:
+    joints = made_up_joints(2, made_up_network(reads_depths=True))
+    assert joints.shape == (2, 14, 5)
+    assert (joints[..., [2, 4]] == 1).all()
+    assert (joints[..., [0, 1, 3]] != 1).all()
+    plain = made_up_joints(2, made_up_network(reads_depths=False))
+    assert plain.shape == (2, 14, 3)
+    assert (plain[..., 2] == 1).all()
 
 
 @pytest.mark.parametrize("name", ["cpm", "cpm-int8"])

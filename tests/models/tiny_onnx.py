@@ -7,7 +7,12 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-UINT8, FLOAT, FLOAT16 = 2, 1, 10
+import numpy as np
+from numpy.typing import NDArray
+
+from library_store.skeleton import LSP14
+
+UINT8, FLOAT, FLOAT16, INT64 = 2, 1, 10, 7
 Axes = Sequence[int | str]
 
 
@@ -40,6 +45,17 @@ def node(operator: str, inputs: Sequence[str], output: str, **integers: int | li
     return data
 
 
+def constant(output: str, array: NDArray[np.float32] | NDArray[np.int64]) -> bytes:
+    """A NodeProto that gives an array."""
+    tensor = b"".join(_field(1, axis) for axis in array.shape)
+    tensor += _field(2, FLOAT if array.dtype == np.float32 else INT64) + _field(9, array.tobytes())
+    return (
+        _field(2, output)
+        + _field(4, "Constant")
+        + _field(5, _field(1, "value") + _field(5, tensor) + _field(20, 4))
+    )
+
+
 def _value(name: str, kind: int, axes: Axes) -> bytes:
     dims = b"".join(_field(1, _field(1 if isinstance(a, int) else 2, a)) for a in axes)
     return _field(1, name) + _field(2, _field(1, _field(1, kind) + _field(2, dims)))
@@ -61,13 +77,50 @@ def model(
     image: Axes = ("n", 32, 32, 3),
     kind: int = UINT8,
     made: int = FLOAT,
+    answer: Axes = ("a", "b", "c", "d"),
     opset: int = 17,
 ) -> bytes:
     """A ModelProto from ``image`` to ``maps``, float unless something else is ``made``."""
     graph = b"".join(_field(1, n) for n in nodes) + _field(2, "tiny")
     graph += _field(11, _value("image", kind, image))
-    graph += _field(12, _value("maps", made, ("a", "b", "c", "d")))
+    graph += _field(12, _value("maps", made, answer))
     return _field(1, 8) + _field(7, graph) + _field(8, _field(2, opset))
+
+
+def believer(columns: int, sigma: float, depths_from: int = 3) -> bytes:
+    """A lifting network that takes joints to be where they are given, all within ``sigma``.
+
+    Of the ``columns`` numbers it is told of a joint, ``depths_from`` is the one it takes for the
+    depth.
+    """
+    n = LSP14.n_joints
+    covariance = np.eye(3 * n, dtype=np.float32)[None] * np.float32(sigma**2)
+    return model(
+        [
+            constant("image_columns", np.array([0, 1])),
+            constant("depth_column", np.array([depths_from])),
+            constant("image_shape", np.array([-1, 1, 2 * n])),
+            constant("depth_shape", np.array([-1, 1, n])),
+            constant("nothing", np.zeros(1, np.float32)),
+            constant("covariance", covariance),
+            node("Gather", ["image", "image_columns"], "points", axis=2),
+            node("Gather", ["image", "depth_column"], "depths", axis=2),
+            node("Reshape", ["points", "image_shape"], "points_row"),
+            node("Reshape", ["depths", "depth_shape"], "depths_row"),
+            node("Concat", ["points_row", "depths_row"], "state", axis=2),
+            node("Mul", ["state", "nothing"], "zeros"),
+            node("Add", ["zeros", "covariance"], "covariances"),
+            node("Concat", ["state", "covariances"], "maps", axis=1),
+        ],
+        image=("n", n, columns),
+        kind=FLOAT,
+        answer=("a", "b", "c"),
+    )
+
+
+def lift_output(**changes: object) -> dict[str, object]:
+    """The output of a lifting network's card."""
+    return {"kind": "lift", "joint_names": LSP14.joint_names} | changes
 
 
 def card(name: str, data: bytes, **changes: object) -> dict[str, object]:

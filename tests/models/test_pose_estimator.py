@@ -1,0 +1,68 @@
+"""From a network's maps to joints in the photo, on a network small enough to know its answers."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from library_store.skeleton import LSP14
+from models import PersonBox, PoseEstimator
+from tests.models import tiny_onnx
+from tests.models.tiny_onnx import node, planes
+
+BRIGHT = np.array([150.0, 200.0, 250.0])
+
+
+@pytest.fixture(params=[True, False], ids=["depths", "none"])
+def estimator(tmp_path: Path, request: pytest.FixtureRequest) -> PoseEstimator:
+    """Takes the brightest blue for the 1st, 4th, ... joint, and its brightness for the depth."""
+    deep: bool = request.param
+    maps = (["planes"] * 9 + ["most"] * 2) if deep else ["planes"] * 5
+    data = tiny_onnx.model(
+        planes(
+            node("ReduceMax", ["planes"], "most", axes=[1]),
+            node("Concat", maps, "all", axis=1),
+            last="all",
+        )
+    )
+    output: Any = tiny_onnx.card("tiny", data)["output"]
+    output |= {"joint_names": LSP14.joint_names, "depths": deep}
+    tiny_onnx.write(tmp_path, "tiny", data, output=output)
+    return PoseEstimator("tiny", weights_dir=tmp_path)
+
+
+def photo(size: int) -> tuple[NDArray[np.uint8], PersonBox]:
+    """A black square with a bright spot, and the box about its middle."""
+    image = np.zeros((size, size, 3), np.uint8)
+    middle = slice(size // 2 - size // 16, size // 2 + size // 16)
+    image[middle, middle] = BRIGHT
+    return image, PersonBox(size / 4, size / 4, size / 2, size / 2, 1.0)
+
+
+def test_depths_are_in_pixels_of_the_photo(estimator: PoseEstimator) -> None:
+    for size in (128, 256, 512):
+        image, box = photo(size)
+        (found,) = estimator.estimate(image, [box])
+        np.testing.assert_allclose(found.positions_px, size / 2, atol=0.1 * size)
+        if not estimator.card.output.model_dump()["depths"]:
+            assert found.depths_px is None
+            continue
+        assert found.depths_px is not None
+        side_px = 1.25 * size / 2
+        expected = BRIGHT[np.arange(14) % 3] * side_px
+        expected[12:] = BRIGHT.max() * side_px
+        np.testing.assert_allclose(found.depths_px, expected, rtol=1e-3)
+
+
+def test_people_are_told_apart(estimator: PoseEstimator) -> None:
+    image, box = photo(256)
+    wide = np.concatenate([image, image // 2], 1)
+    other = PersonBox(box.x_px + 256, box.y_px, box.width_px, box.height_px, 1.0)
+    found = estimator.estimate(wide, [box, other])
+    for person, own in zip(found, (box, other), strict=True):
+        (alone,) = estimator.estimate(wide, [own])
+        assert (person.depths_px is None) == (alone.depths_px is None)
+        if person.depths_px is not None and alone.depths_px is not None:
+            np.testing.assert_allclose(person.depths_px, alone.depths_px, rtol=1e-6)
