@@ -231,6 +231,7 @@ class Pipeline:
                 joints_px=found.positions_px,
                 confidence=found.belief,
                 covariance_px2=found.covariance_px2,
+                depths_px=found.depths_px,
             )
             for found in joints
         ]
@@ -353,6 +354,7 @@ def _to_image(joints: Joints2D, photo: Photo) -> Joints2D:
         positions_px=joints.positions_px * photo.reduction + np.array(photo.offset_px),
         covariance_px2=joints.covariance_px2 * photo.reduction**2,
         sigma_px=None if joints.sigma_px is None else joints.sigma_px * photo.reduction,
+        depths_px=None if joints.depths_px is None else joints.depths_px * photo.reduction,
     )
 
 

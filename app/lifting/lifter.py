@@ -173,6 +173,9 @@ class Lifter:
         warnings = ["assumed_focal"] if intrinsics.source == "assumed" else []
         warnings.extend(truncated)
 
+        depths = None
+        if person.depths_px is not None:
+            depths = person.depths_px / intrinsics.focal_length_px
         outliers = 0
         while True:
             view = centre_view(
@@ -189,7 +192,7 @@ class Lifter:
             lap("match")
             if method == "paper":
                 break
-            fused = self._fuse(view, confidence, neighbours)
+            fused = self._fuse(view, confidence, depths, neighbours)
             lap("warp")
             if fused.outlier is None or outliers == settings.max_outliers:
                 break
@@ -260,7 +263,14 @@ class Lifter:
             rotations=self._library.rotations(entries),
         )
 
-    def _fuse(self, view: CentredView, confidence: Floats, neighbours: _Neighbours) -> FusedPose:
+    def _fuse(
+        self,
+        view: CentredView,
+        confidence: Floats,
+        depths: Floats | None,
+        neighbours: _Neighbours,
+    ) -> FusedPose:
+        """The posterior; ``depths`` (14,) as the network takes them, relative to the hips'."""
         weights = (confidence > 0).astype(np.float64)
         ensemble = place_ensemble(
             neighbours.poses_mm,
@@ -272,7 +282,9 @@ class Lifter:
         covariance = view.covariance
         if covariance is not None:
             covariance = covariance * ensemble.px_per_unit**2
-        learned = None if self._network is None else self._network.lift(view.points, confidence)
+        learned = None
+        if self._network is not None:
+            learned = self._network.lift(view.points, confidence, depths)
         return fuse(ensemble, view.points, confidence, covariance, self._settings.fusion, learned)
 
     def _shortlist(

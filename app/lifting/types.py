@@ -26,13 +26,16 @@ class Observation:
 
     ``joints_px`` (14, 2) float64; ``confidence`` (14,) in [0, 1], 0 = missing (its pixel is
     ignored and may be NaN); ``covariance_px2`` (14, 2, 2) px², or None when unknown: the noise is
-    then estimated from the joints themselves. ``ValueError`` on wrong shapes, on confidences
-    outside [0, 1] and on present joints that are not finite.
+    then estimated from the joints themselves; ``depths_px`` (14,) how much farther from the camera
+    than the hip midpoint each joint is by what the picture shows of it, in pixels at the hips'
+    distance, ``(z / z_root - 1) * focal_length_px``, or None when unknown. ``ValueError`` on wrong
+    shapes, on confidences outside [0, 1] and on present joints that are not finite.
     """
 
     joints_px: Floats
     confidence: Floats
     covariance_px2: Floats | None = None
+    depths_px: Floats | None = None
 
     def __post_init__(self) -> None:
         n = LSP14.n_joints
@@ -48,6 +51,11 @@ class Observation:
                 raise ValueError(f"covariance_px2 must be ({n}, 2, 2)")
             if not np.isfinite(self.covariance_px2[present]).all():
                 raise ValueError("the covariance of a present joint is not finite")
+        if self.depths_px is not None:
+            if self.depths_px.shape != (n,):
+                raise ValueError(f"depths_px must be ({n},)")
+            if not np.isfinite(self.depths_px[present]).all():
+                raise ValueError("the depth of a present joint is not finite")
 
 
 @dataclass(frozen=True)

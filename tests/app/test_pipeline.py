@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from app.lifting.lifter import Lifter
-from app.lifting.types import NotLiftable
+from app.lifting.types import NotLiftable, Observation
 from app.pipeline import PhotoQuery, Pipeline
 from models import Joints2D, PersonBox
 
@@ -26,6 +26,8 @@ class Boxes:
     real: str
     close: bool = False
     asked: list[int] = field(default_factory=list)
+    depths_px: NDArray[np.float64] | None = None
+    told: list[Observation] = field(default_factory=list)
 
     def detect(self, image: NDArray[np.uint8], max_people: int) -> list[PersonBox]:
         del image
@@ -47,6 +49,7 @@ class Boxes:
                 confidence=np.full(14, 0.9 if self._is_real(box) else 0.05),
                 sigma_px=None,
                 peak=np.full(14, 0.9),
+                depths_px=self.depths_px,
             )
             for box in boxes
         ]
@@ -54,7 +57,8 @@ class Boxes:
     def _is_real(self, box: PersonBox) -> bool:
         return box.width_px > 300 or self.real[round(box.x_px / 30)] == "x"
 
-    def lift(self, observations: Sequence[object], *_: Any, **__: Any) -> list[NotLiftable]:
+    def lift(self, observations: Sequence[Observation], *_: Any, **__: Any) -> list[NotLiftable]:
+        self.told.extend(observations)
         return [NotLiftable("too few joints")] * len(observations)
 
 
@@ -93,3 +97,25 @@ def test_whoever_fills_the_photo_is_looked_for_where_nobody_else_is(
     (person,) = pipeline.estimate(PHOTO, PhotoQuery()).people
     assert person.box_px[2] == width_px
     assert boxes.asked == asked
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("reduction", [1, 2, 4])
+def test_depths_are_lifted_in_pixels_of_the_photo_as_it_was_sent(
+    reduction: int, mirrored: bool
+) -> None:
+    photo = cv2.imencode(".jpg", np.zeros((60, 400, 3), np.uint8))[1].tobytes()
+    depths_px = np.random.default_rng(1).normal(0, 9, 14)
+    boxes = Boxes("x", depths_px=depths_px)
+    lifter = cast("Lifter", boxes)
+    side_px = 400 // reduction
+    pipeline = Pipeline(boxes, boxes, lifter, max_pixels=10**6, decode_side_px=side_px)
+    pipeline.estimate(photo, PhotoQuery(mirrored=mirrored))
+    (told,) = boxes.told
+    assert told.covariance_px2 is not None
+    np.testing.assert_allclose(told.covariance_px2, np.tile(reduction**2 * np.eye(2), (14, 1, 1)))
+    assert told.depths_px is not None
+    np.testing.assert_allclose(told.depths_px, reduction * depths_px)
+    boxes.depths_px = None
+    pipeline.estimate(photo, PhotoQuery(mirrored=mirrored))
+    assert boxes.told[1].depths_px is None
