@@ -106,7 +106,7 @@ def find_joints(renders: Path, estimator: PoseEstimator) -> Iterator[Seen]:
         (found,) = estimator.estimate(images[record["image"]], [box])
         centre_x, centre_y = record["principal_point_px"]
         yield Seen(
-            Observation(found.positions_px, found.belief, found.covariance_px2),
+            Observation(found.positions_px, found.belief, found.covariance_px2, found.depths_px),
             Intrinsics(record["focal_length_px"], (centre_x, centre_y), "request"),
             np.array(record["joints_mm"]),
         )

@@ -32,15 +32,16 @@ CANDIDATES = 1_000
 class Seen2D:
     """2D of N views.
 
-    ``points_px`` (N, 14, 2); from a network also its own ``confidence`` (N, 14) and
-    ``covariance_px2`` (N, 14, 2, 2), which the paper's method does not look at; ``present``
-    (N, 14), all by default.
+    ``points_px`` (N, 14, 2); from a network also its own ``confidence`` (N, 14),
+    ``covariance_px2`` (N, 14, 2, 2) and ``depths_px`` (N, 14) if it says any, which the paper's
+    method does not look at; ``present`` (N, 14), all by default.
     """
 
     points_px: Floats
     confidence: Floats | None = None
     covariance_px2: Floats | None = None
     present: Mask | None = None
+    depths_px: Floats | None = None
 
     @property
     def there(self) -> Mask:
@@ -50,12 +51,13 @@ class Seen2D:
 
     def of(self, rows: Integers) -> Seen2D:
         """That of some of the views."""
-        confidence, covariance = self.confidence, self.covariance_px2
+        confidence, covariance, depths = self.confidence, self.covariance_px2, self.depths_px
         return Seen2D(
             self.points_px[rows],
             None if confidence is None else confidence[rows],
             None if covariance is None else covariance[rows],
             self.there[rows],
+            None if depths is None else depths[rows],
         )
 
     def observation(self, row: int, *, plain: bool) -> Observation:
@@ -64,7 +66,8 @@ class Seen2D:
         if plain or self.confidence is None or self.covariance_px2 is None:
             return Observation(points, self.there[row].astype(np.float64))
         confidence = np.where(self.there[row], self.confidence[row], 0.0)
-        return Observation(points, confidence, self.covariance_px2[row])
+        depths = None if self.depths_px is None else self.depths_px[row]
+        return Observation(points, confidence, self.covariance_px2[row], depths)
 
 
 @dataclass(frozen=True)

@@ -50,7 +50,7 @@ def look_at_videos(views: Views, videos: dict[Key, Path]) -> tuple[Views, Seen2D
     truth = views.points_px()
     missing: list[str] = []
     rows: list[int] = []
-    points, confidence, covariance = [], [], []
+    points, confidence, covariance, depths = [], [], [], []
     for camera, own in followed(views.by_camera(), "videos"):
         scene = views.scenes[int(views.scene[own[0]])]
         key = (scene.clip.subject, scene.action, _trial(scene.clip.action), camera.name)
@@ -72,6 +72,7 @@ def look_at_videos(views: Views, videos: dict[Key, Path]) -> tuple[Views, Seen2D
             points.append(joints.positions_px)
             confidence.append(joints.belief)
             covariance.append(joints.covariance_px2)
+            depths.append(joints.depths_px)
             rows.append(row)
             read += 1
         if read < len(own):
@@ -82,6 +83,7 @@ def look_at_videos(views: Views, videos: dict[Key, Path]) -> tuple[Views, Seen2D
         np.array(points, np.float64),
         np.array(confidence, np.float64),
         np.array(covariance, np.float64),
+        depths_px=None if depths[0] is None else np.array(depths, np.float64),
     )
     return views[np.array(rows)], seen, missing
 

@@ -331,6 +331,21 @@ def test_drawn_is_who_both_methods_lift(users_folder: Path, tmp_path: Path) -> N
     assert not figures.liftable(test, "x", library)
 
 
+def test_what_a_network_says_of_a_person_is_lifted_with_them() -> None:
+    rng = np.random.default_rng(0)
+    points, confidence = rng.normal(size=(3, 14, 2)), rng.uniform(0.5, 1.0, (3, 14))
+    sharp = np.broadcast_to(np.eye(2), (3, 14, 2, 2))
+    depths = rng.normal(size=(3, 14))
+    some = Seen2D(points, confidence, sharp, depths_px=depths).of(np.array([2, 0]))
+    told = some.observation(0, plain=False)
+    assert told.depths_px is not None
+    np.testing.assert_array_equal(told.depths_px, depths[2])
+    np.testing.assert_array_equal(told.confidence, confidence[2])
+    assert some.observation(0, plain=True).depths_px is None
+    untold = Seen2D(points, confidence, sharp).of(np.array([2])).observation(0, plain=False)
+    assert untold.depths_px is None
+
+
 def test_orbit_rows_invert_rotations() -> None:
     rng = np.random.default_rng(0)
     rows = np.stack(
