@@ -30,13 +30,15 @@ class Sample:
 
     ``image`` (size, size, 3) uint8 BGR; ``joints_px`` (14, 2) float32 in its pixels; ``weight``
     (14,) trust in the position, 0 outside the crop; ``presence`` (14,) 1 seen, 0 known to be
-    outside the crop, -1 unknown.
+    outside the crop, -1 unknown; ``depths`` (14,) less the hip midpoint's, over the crop's side,
+    nan where unknown.
     """
 
     image: Image
     joints_px: NDArray[np.float32]
     weight: NDArray[np.float32]
     presence: NDArray[np.float32]
+    depths: NDArray[np.float32]
 
 
 def crop_matrix(
@@ -74,8 +76,12 @@ def _warp(
     image = warped(crop.image, matrix, (size, size), border=border, value=value)
     joints = crop.joints_px @ matrix[:, :2].T + matrix[:, 2]
     weight, visible = crop.weight, crop.visible
+    depths = np.full(len(joints), np.nan) if crop.depths_px is None else crop.depths_px
+    depths = depths * np.sqrt(abs(np.linalg.det(matrix[:, :2]))) / size
     if flip:
-        joints, weight, visible = joints[MIRROR], weight[MIRROR], visible[MIRROR]
+        joints, weight, visible, depths = (
+            of_joints[MIRROR] for of_joints in (joints, weight, visible, depths)
+        )
     inside = ((joints >= -0.5) & (joints <= size - 0.5)).all(1)
     presence = np.where(visible > 0, 1.0, -1.0)
     presence = np.where((weight > 0) & ~inside, 0.0, presence)
@@ -84,6 +90,7 @@ def _warp(
         joints.astype(np.float32),
         np.where(inside, weight, 0).astype(np.float32),
         presence.astype(np.float32),
+        depths.astype(np.float32),
     )
 
 
@@ -110,7 +117,7 @@ def random_view(
     if rng.random() < 0.35:
         for _ in range(rng.integers(1, 3)):
             _occlude(image, sample.joints_px, presence, other.image, rng)
-    return Sample(expose(image, rng), sample.joints_px, sample.weight, presence)
+    return replace(sample, image=expose(image, rng), presence=presence)
 
 
 def in_company(crop: LabelledCrop, other: LabelledCrop, rng: np.random.Generator) -> LabelledCrop:

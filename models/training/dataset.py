@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import tarfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +50,8 @@ class LabelledCrop:
 
     ``image`` (h, w, 3) uint8 BGR; ``joints_px`` (14, 2) float32; ``weight`` (14,) float32, how far
     the position is trusted; ``visible`` (14,) float32, 1 where the joint is known to be seen;
-    ``wild`` marks sport poses, which may stand on their heads.
+    ``wild`` marks sport poses, which may stand on their heads; ``depths_px`` (14,) float32, how
+    much farther than the hip midpoint, in pixels at its distance, nan where unknown (None: all).
     """
 
     name: str
@@ -60,6 +61,7 @@ class LabelledCrop:
     weight: NDArray[np.float32]
     visible: NDArray[np.float32]
     wild: bool
+    depths_px: NDArray[np.float32] | None = None
 
     @property
     def extent_px(self) -> tuple[NDArray[np.float32], float]:
@@ -132,7 +134,22 @@ def _from_labels(record: dict[str, Any], image: Image, group: int) -> LabelledCr
         weight=labelled,
         visible=np.asarray(record.get("visible", labelled), np.float32) * labelled,
         wild=bool(record.get("wild", True)),
+        depths_px=depths_of(record) if "joints_mm" in record else None,
     )
+
+
+def depths_of(record: dict[str, Any]) -> NDArray[np.float32]:
+    """Depths (14,) of a rendered person's joints less the hips', pixels at the hips' distance.
+
+    Along the ray through the middle of the joints, which is how a crop shows them.
+    """
+    joints_mm = np.asarray(record["joints_mm"], np.float64)
+    rays = joints_mm / np.linalg.norm(joints_mm, axis=1, keepdims=True)
+    middle = rays.mean(0)
+    depth_mm = joints_mm @ (middle / np.linalg.norm(middle))
+    root_mm = 0.5 * (depth_mm[R_HIP] + depth_mm[L_HIP])
+    depths: NDArray[np.float64] = (depth_mm / root_mm - 1.0) * float(record["focal_length_px"])
+    return depths.astype(np.float32)
 
 
 def _trust(
@@ -232,14 +249,27 @@ def held_out(crop: LabelledCrop) -> bool:
     return in_held_out_group(crop.group)
 
 
+def with_depths(crops: list[LabelledCrop], path: Path) -> list[LabelledCrop]:
+    """The crops with the depths that ``depth_teacher`` wrote for their set.
+
+    Raises ``AnnotationError`` for another set's.
+    """
+    with np.load(path, allow_pickle=False) as stored:
+        depths = dict(zip(stored["image"].tolist(), stored["depths_px"], strict=True))
+    if not depths.keys() >= {crop.name for crop in crops}:
+        raise AnnotationError(f"{path} has the depths of another set")
+    return [replace(crop, depths_px=depths[crop.name]) for crop in crops]
+
+
 def read_crops(
-    folder: Path, train: str, test: str
+    folder: Path, train: str, test: str, depths: Path | None = None
 ) -> tuple[list[LabelledCrop], dict[str, list[LabelledCrop]]]:
     """Training crops, and by name the held-out ones that errors can be measured on.
 
     Comma-separated names of tars in ``folder``, or paths, without ".tar"; ``name*2`` is drawn
     twice as often. Files called lspet* and rendered* are trained on whole but for their last crops,
-    of others one photo in ``HOLD_OUT_ONE_IN`` is held out.
+    of others one photo in ``HOLD_OUT_ONE_IN`` is held out. ``depths`` is a folder with what
+    ``depth_teacher`` wrote, a name.npz for sets without depths of their own; others have none.
     """
     crops: list[LabelledCrop] = []
     kept: dict[str, list[LabelledCrop]] = {"photos_dev": [], "labelled_dev": []}
@@ -247,6 +277,8 @@ def read_crops(
         name, _, times = item.partition("*")
         loaded = load(folder / f"{name}.tar")
         kind = Path(name).name
+        if depths is not None and (depths / f"{kind}.npz").exists():
+            loaded = with_depths(loaded, depths / f"{kind}.npz")
         if kind.startswith("lspet"):
             kept["labelled_dev"] += loaded[-DEV_LABELLED:]
             used = loaded[:-DEV_LABELLED]

@@ -95,6 +95,7 @@ def config_of(weights: dict[str, Tensor]) -> CpmConfig:
         blocks=(n4, n8, n16, n32),
         stage_width=weights["stages.0.score.weight"].shape[1],
         n_stages=count("stages."),
+        depths="depth.score.weight" in weights,
     )
 
 
@@ -117,6 +118,7 @@ def pose_card(network: ConvolutionalPoseMachine, name: str, version: str, size: 
             stride_px=4.0,
             target_sigma_cells=FINE_SIGMA_CELLS,
             maps="logits",
+            depths=network.cfg.depths,
         ),
         training_data=[LABELLED, PHOTOS, RENDERED],
         licence="Apache-2.0 (weights); the training images keep their own terms",

@@ -156,7 +156,7 @@ def finetune(
         return to_batch([random_view(train[i], train[j], size, rng) for i, j in picked])
 
     def loss_of(model: ConvolutionalPoseMachine, batch: loop.Batch) -> Tensor:
-        x, joints, weight, presence = batch
+        x, joints, weight, presence, _ = batch
         with mixed_precision(device):
             stages = model(x)
         return total_loss(stages, joints, weight, presence, x.shape[-1])

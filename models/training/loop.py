@@ -104,16 +104,26 @@ def _average_into(ema: nn.Module, model: nn.Module, decay: float) -> None:
 
 
 def _start_from(path: Path, model: nn.Module) -> None:
-    """Load a checkpoint's averaged weights, or those of an exported ONNX file."""
+    """Load a checkpoint's averaged weights, or those of an exported ONNX file.
+
+    What begins with the model's ``ADDED`` may be new to it.
+    """
     if path.suffix == ".onnx":
         from models.training.export import read_weights
 
-        missing = model.load_state_dict(read_weights(path), strict=False).missing_keys
-        unset = [key for key in missing if not key.endswith("num_batches_tracked")]
-        if unset:
-            raise SystemExit(f"{path} is of another architecture: it lacks {unset[:3]} ...")
+        weights = read_weights(path)
     else:
-        model.load_state_dict(read_checkpoint(path)["ema"])
+        weights = read_checkpoint(path)["ema"]
+    missing, unknown = model.load_state_dict(weights, strict=False)
+    added = getattr(model, "ADDED", None)
+    unset = [
+        key
+        for key in missing
+        if not key.endswith("num_batches_tracked") and not (added and key.startswith(added))
+    ]
+    if unset or unknown:
+        lacks = f"lacks {unset[:3]} ..." if unset else f"has {unknown[:3]} ... too"
+        raise SystemExit(f"{path} is of another architecture: it {lacks}")
 
 
 def read_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:

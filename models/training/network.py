@@ -2,7 +2,8 @@
 
 All convolutions are dense (no depthwise ones): on CPUs with bf16 or int8 matrix tiles only those
 profit, and elsewhere they cost little more. Every stage emits 14 joint maps and a background map,
-each stage reads the beliefs of the one before (Wei et al. 2016), every stage is supervised.
+each stage reads the beliefs of the one before (Wei et al. 2016), every stage is supervised. Beside
+the last stage lie maps of how deep each joint would be, were it in a cell (Mehta et al. 2017).
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ class CpmConfig:
     blocks: tuple[int, int, int, int] = (1, 2, 3, 2)
     stage_width: int = 96
     n_stages: int = 3
+    depths: bool = False
 
     def as_dict(self) -> dict[str, object]:
         """Plain values, for JSON."""
@@ -126,12 +128,45 @@ class Stage(nn.Module):
         return x, self.score(x)
 
 
+class DepthHead(nn.Module):
+    """Features and the last stage's -> a map per joint of its depth, were it there, at stride 8.
+
+    Depths are less the hip midpoint's, over the crop's side; to be read where the joint is.
+    """
+
+    def __init__(self, cfg: CpmConfig) -> None:
+        super().__init__()
+        s = cfg.stage_width
+        self.enter = _conv_bn(2 * s, s, 1)
+        self.body = Residual(s, s)
+        self.score = nn.Conv2d(s, cfg.n_joints, 1)
+        nn.init.zeros_(self.score.weight)
+        nn.init.zeros_(self.score.bias)
+
+    def forward(self, features: Tensor, hidden: Tensor) -> Tensor:
+        """(B, s, h, w) each -> (B, J, h, w)."""
+        out: Tensor = self.score(self.body(F.relu(self.enter(torch.cat([features, hidden], 1)))))
+        return out
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the network makes of crops: logits per stage, and what depths are read from."""
+
+    stages: list[Tensor]
+    features: Tensor
+    hidden: Tensor
+
+
 class ConvolutionalPoseMachine(nn.Module):
     """Image crop -> one logit map per joint and one for the background, per stage.
 
     The stages work at stride 8; the last logits are raised to stride 4 with the backbone's fine
     features for sub-pixel joints.
     """
+
+    ADDED = "depth."
+    """Parameters that networks may lack which training goes on from."""
 
     def __init__(self, cfg: CpmConfig) -> None:
         super().__init__()
@@ -144,9 +179,20 @@ class ConvolutionalPoseMachine(nn.Module):
         self.fine_score = nn.Conv2d(w, out, 1)
         nn.init.zeros_(self.fine_score.weight)
         nn.init.zeros_(self.fine_score.bias)
+        self.depth = DepthHead(cfg) if cfg.depths else None
 
     def forward(self, image: Tensor) -> list[Tensor]:
         """(B, 3, H, W) in [-1, 1] -> logits per stage: (B, 15, H/8, W/8) ..., (B, 15, H/4, W/4)."""
+        return self.seen(image).stages
+
+    def depths(self, seen: Seen) -> Tensor:
+        """The depth maps (B, 14, H/8, W/8) of a network that has them."""
+        assert self.depth is not None
+        maps: Tensor = self.depth(seen.features, seen.hidden)
+        return maps
+
+    def seen(self, image: Tensor) -> Seen:
+        """``forward``, and the features that it came by."""
         x4, features = self.backbone(image)
         logits: Tensor | None = None
         every: list[Tensor] = []
@@ -158,7 +204,7 @@ class ConvolutionalPoseMachine(nn.Module):
         up = F.interpolate(logits, scale_factor=2.0, mode="bilinear", align_corners=False)
         x = self.fine(F.relu(x4 + _up2(self.fine_low(hidden))))
         every.append(up + self.fine_score(x))
-        return every
+        return Seen(every, features, hidden)
 
 
 @dataclass(frozen=True)

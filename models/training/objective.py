@@ -1,4 +1,4 @@
-"""The loss: where is each joint (spatial cross-entropy), on which side, and is it there at all."""
+"""The loss: where is each joint, on which side, is it there at all, and how deep does it lie."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from torch.nn import functional as F
 from library_store.skeleton import LSP14
 
 PRESENCE_WEIGHT = 0.1
+DEPTH_WEIGHT = 10.0
 EXCHANGE_WEIGHT = 1.5
 APART = 0.06
 """Share of the input's side from which on two joints of a pair count as being in two places."""
@@ -95,3 +96,25 @@ def total_loss(
     ]
     terms += [stage_loss(stages[-1], joints_px, weight, presence, size, FINE_SIGMA_CELLS)] * 2
     return torch.stack(terms).mean()
+
+
+def depth_loss(maps: Tensor, logits: Tensor, depths: Tensor, weight: Tensor) -> Tensor:
+    """Mean distance of the depths that are read where the joints are believed from the true ones.
+
+    Args:
+        maps: (B, J, h, w) depths over the crop's side.
+        logits: (B, J + 1, h, w) of the same stride; they learn nothing by this.
+        depths: (B, J) likewise, nan where unknown.
+        weight: (B, J) trust in the joints' labels.
+
+    """
+    found = read_depths(maps, logits)
+    trust = weight * torch.isfinite(depths)
+    distance = (found - torch.nan_to_num(depths)).abs() * trust
+    return DEPTH_WEIGHT * distance.sum() / trust.sum().clamp_min(1.0)
+
+
+def read_depths(maps: Tensor, logits: Tensor) -> Tensor:
+    """Depth maps (B, J, h, w) read where logits (B, J + 1, h, w) believe the joints: (B, J)."""
+    where = torch.softmax(logits[:, : maps.shape[1]].detach().float().flatten(2), -1)
+    return (where * maps.float().flatten(2)).sum(-1)

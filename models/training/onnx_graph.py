@@ -250,7 +250,10 @@ def _beliefs(w: GraphWriter, hidden: str, score: nn.Conv2d) -> str:
 
 
 def pose_model(network: ConvolutionalPoseMachine, size_px: int) -> onnx.ModelProto:
-    """uint8 (n, size, size, 3) BGR -> the last logits (n, 15, size / 4, size / 4)."""
+    """uint8 (n, size, size, 3) BGR -> the last logits (n, 15, size / 4, size / 4).
+
+    Depth maps, if the network has them, come after them, (n, 29, ...).
+    """
     w = GraphWriter(network)
     x4, features = _backbone(w, INPUT, network.backbone)
     hidden, beliefs = features, ""
@@ -264,10 +267,16 @@ def pose_model(network: ConvolutionalPoseMachine, size_px: int) -> onnx.ModelPro
     coarse = w.up2(coarse, "linear", name=LAST + "raised")
     fine = w.conv(fine, network.fine_score, name=LAST + "fine")
     result = w.node("Add", fine, coarse, name=LAST + "sum")
+    channels = network.fine_score.out_channels
+    if network.depth is not None:
+        both = w.node("Concat", features, hidden, axis=1)
+        deep = w.residual(w.conv_norm(both, network.depth.enter, relu=True), network.depth.body)
+        deep = w.conv(deep, network.depth.score, name=LAST + "depths")
+        deep = w.up2(deep, name=LAST + "depths_raised")
+        result = w.node("Concat", result, deep, axis=1, name=LAST + "maps")
+        channels += network.cfg.n_joints
     side = size_px // 4
-    return w.model(
-        result, ("n", size_px, size_px, 3), ("n", network.fine_score.out_channels, side, side)
-    )
+    return w.model(result, ("n", size_px, size_px, 3), ("n", channels, side, side))
 
 
 def person_model(network: PersonNetwork) -> onnx.ModelProto:

@@ -34,6 +34,18 @@ class TeacherPerson:
     score: float
 
 
+@dataclass(frozen=True)
+class TeacherPose:
+    """One person, and how sure the teacher is that somebody is there.
+
+    ``landmarks_px`` (33, 2) in the image's pixels, ``depths_px`` (33,) less the hips', likewise.
+    """
+
+    landmarks_px: NDArray[np.float64]
+    depths_px: NDArray[np.float64]
+    score: float
+
+
 def onnx_session(path: Path) -> ort.InferenceSession:
     """A single-threaded session on the CPU."""
     options = ort.SessionOptions()
@@ -96,6 +108,13 @@ class BlazePose:
         self, image: Image, hip: NDArray[np.float64], rim: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], float]:
         """(33, 2) landmarks in the image's pixels and the presence score."""
+        seen = self.person(image, hip, rim)
+        return seen.landmarks_px, seen.score
+
+    def person(
+        self, image: Image, hip: NDArray[np.float64], rim: NDArray[np.float64]
+    ) -> TeacherPose:
+        """Landmarks and depths of the person with this mid-hip, within a circle through ``rim``."""
         up = rim - hip
         side = 2 * 1.25 * float(np.linalg.norm(up))
         angle = np.arctan2(up[0], -up[1])
@@ -106,11 +125,18 @@ class BlazePose:
         matrix = np.concatenate([linear, shift[:, None]], 1)
         crop = cv2.warpAffine(image, matrix, (LANDMARK_SIZE, LANDMARK_SIZE))
         x = crop[None, :, :, ::-1].astype(np.float32) / 255
-        names = ["Identity", "Identity_1"]
-        points, presence = self._landmarks.run(names, {self._landmarks.get_inputs()[0].name: x})
+        names = ["Identity", "Identity_1", "Identity_4"]
+        points, presence, metres = self._landmarks.run(
+            names, {self._landmarks.get_inputs()[0].name: x}
+        )
         at = points.reshape(39, 5)[:33, :2].astype(np.float64)
+        world = metres.reshape(39, 3)[:33].astype(np.float64)
+        # Pixels a metre: what best maps the limbs' metres onto their places in the crop.
+        body = list(_BODY)
+        here, there = (part[body, :2] - part[body, :2].mean(0) for part in (world, at))
+        px_per_metre = (here * there).sum() / max(float((here * here).sum()), 1e-9)
         back: NDArray[np.float64] = (at - shift) @ np.linalg.inv(linear).T
-        return back, float(presence.reshape(-1)[0])
+        return TeacherPose(back, world[:, 2] * px_per_metre / scale, float(presence.reshape(-1)[0]))
 
     def people(
         self, image: Image, threshold: float = 0.5, tiles: bool = True

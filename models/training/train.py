@@ -7,6 +7,7 @@ metrics: see loop.py.
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,12 +19,12 @@ from models.training import loop
 from models.training.augment import Sample, canonical, random_view
 from models.training.dataset import LabelledCrop, read_crops
 from models.training.network import ConvolutionalPoseMachine, CpmConfig
-from models.training.objective import total_loss
+from models.training.objective import depth_loss, read_depths, total_loss
 from models.training.precision import mixed_precision
 
 
-def to_batch(samples: list[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Samples -> (image (B,3,S,S) in [-1,1], joints (B,14,2), weight (B,14), presence (B,14))."""
+def to_batch(samples: list[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Samples -> image (B,3,S,S) in [-1,1], joints (B,14,2); weight, presence, depths (B,14)."""
     images = torch.from_numpy(np.stack([s.image for s in samples]))
     x = images.permute(0, 3, 1, 2).float().mul_(1 / 127.5).sub_(1)
     return (
@@ -31,6 +32,7 @@ def to_batch(samples: list[Sample]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         torch.from_numpy(np.stack([s.joints_px for s in samples])),
         torch.from_numpy(np.stack([s.weight for s in samples])),
         torch.from_numpy(np.stack([s.presence for s in samples])),
+        torch.from_numpy(np.stack([s.depths for s in samples])),
     )
 
 
@@ -59,7 +61,7 @@ def measure(
     predicted, truth, known = [], [], []
     for start in range(0, len(crops), 64):
         samples = [canonical(c, size) for c in crops[start : start + 64]]
-        x, joints, weight, _ = to_batch(samples)
+        x, joints, weight, *_ = to_batch(samples)
         with torch.no_grad(), mixed_precision(device):
             logits = model(x.to(device))[-1]
         predicted.append(peaks_px(logits, model.cfg.n_joints, size))
@@ -67,6 +69,21 @@ def measure(
         known.append(weight.numpy() > 0)
     correct = correct_keypoints(np.concatenate(predicted), np.concatenate(truth))
     return float(correct[np.concatenate(known)].mean())
+
+
+def measure_depths(
+    model: ConvolutionalPoseMachine, crops: list[LabelledCrop], size: int, device: str
+) -> float:
+    """Mean distance of the depths from the known ones over the crop's side."""
+    errors = []
+    for start in range(0, len(crops), 64):
+        x, _, weight, _, depths = to_batch([canonical(c, size) for c in crops[start : start + 64]])
+        with torch.no_grad(), mixed_precision(device):
+            seen = model.seen(x.to(device))
+            maps = model.depths(seen)
+        found = read_depths(maps, seen.stages[-2]).cpu()
+        errors.append((found - depths).abs()[(weight > 0) & torch.isfinite(depths)])
+    return float(torch.cat(errors).mean())
 
 
 def main() -> None:
@@ -82,10 +99,14 @@ def main() -> None:
     parser.add_argument("--blocks", default="2,3,4,3")
     parser.add_argument("--stage-width", type=int, default=64)
     parser.add_argument("--stages", type=int, default=3)
+    parser.add_argument("--depths", type=Path, help="learn depth maps; what depth_teacher wrote")
+    parser.add_argument("--only-depths", action="store_true", help="all else stays as it is")
     args = parser.parse_args()
+    if args.only_depths and args.depths is None:
+        parser.error("--only-depths needs --depths")
 
     torch.manual_seed(args.seed)
-    crops, kept = read_crops(args.data, args.train, args.test)
+    crops, kept = read_crops(args.data, args.train, args.test, args.depths)
     print({"train": len(crops)} | {k: len(v) for k, v in kept.items()}, flush=True)
     n4, n8, n16, n32 = (int(b) for b in args.blocks.split(","))
     cfg = CpmConfig(
@@ -93,6 +114,7 @@ def main() -> None:
         blocks=(n4, n8, n16, n32),
         stage_width=args.stage_width,
         n_stages=args.stages,
+        depths=args.depths is not None,
     )
 
     def make_batch(step: int, size: int) -> loop.Batch:
@@ -101,13 +123,33 @@ def main() -> None:
         return to_batch([random_view(crops[i], crops[j], size, rng) for i, j in picked])
 
     def loss_of(model: ConvolutionalPoseMachine, batch: loop.Batch) -> Tensor:
-        x, joints, weight, presence = batch
+        x, joints, weight, presence, depths = batch
+        if args.only_depths:
+            model.eval()  # statistics of the batch norms stay as well
+            assert model.depth is not None
+            model.depth.train()
         with mixed_precision(args.device):
-            stages = model(x)
-        return total_loss(stages, joints, weight, presence, x.shape[-1])
+            with torch.set_grad_enabled(not args.only_depths):
+                seen = model.seen(x)
+            maps = model.depths(seen) if cfg.depths else None
+        if maps is None:
+            return total_loss(seen.stages, joints, weight, presence, x.shape[-1])
+        of_depths = depth_loss(maps, seen.stages[-2], depths, weight)
+        if args.only_depths:
+            return of_depths
+        return of_depths + total_loss(seen.stages, joints, weight, presence, x.shape[-1])
+
+    measured = {name: those for name, those in kept.items() if those}
+    deep = {k: v for k, v in measured.items() if any(c.depths_px is not None for c in v)}
 
     def evaluate(model: ConvolutionalPoseMachine, size: int) -> dict[str, float]:
-        return {f"pck_0.2/{k}": measure(model, v, size, args.device) for k, v in kept.items()}
+        found = {f"pck_0.2/{k}": measure(model, v, size, args.device) for k, v in measured.items()}
+        if cfg.depths:
+            found |= {
+                f"depth_error/{k}": measure_depths(model, v, size, args.device)
+                for k, v in deep.items()
+            }
+        return found
 
     loop.fit(
         ConvolutionalPoseMachine(cfg),

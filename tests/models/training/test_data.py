@@ -2,6 +2,7 @@
 
 import json
 import tarfile
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from models.training.dataset import (
     DEV_RENDERED,
     LabelledCrop,
     decode_members,
+    depths_of,
     held_out,
     load,
     read_crops,
@@ -185,6 +187,58 @@ def test_joints_outside_a_view_are_absent_and_not_learned_as_places() -> None:
         assert (view.weight[outside] == 0).all()
         assert (view.presence[outside] == 0).all()
         assert (view.weight[~outside] > 0).all()
+
+
+def test_depths_grow_with_a_view_and_change_sides_in_the_mirror() -> None:
+    depths = np.arange(14, dtype=np.float32) - 6
+    crop = replace(labelled_crop(1), depths_px=depths)
+    _, extent = crop.extent_px
+    np.testing.assert_allclose(canonical(crop, 96).depths, depths / (extent * 1.25), rtol=1e-5)
+    here = np.concatenate([crop.joints_px, np.ones((14, 1))], 1)
+    orders = set()
+    for seed in range(20):
+        view = random_view(crop, crop, 64, np.random.default_rng(seed))
+        # The view is an affine map of the joints, in their own order or with the sides exchanged.
+        (own,) = (
+            order
+            for order in (tuple(range(14)), tuple(int(i) for i in MIRROR))
+            if np.linalg.lstsq(here, view.joints_px[list(order)])[1].sum() < 0.1
+        )
+        np.testing.assert_allclose(
+            view.depths[list(own)] / view.depths[0], depths / depths[0], rtol=1e-4, atol=1e-5
+        )
+        orders.add(own)
+    assert len(orders) == 2
+    assert np.isnan(canonical(labelled_crop(1), 64).depths).all()
+
+
+def test_rendered_depths_are_along_the_ray_to_the_person() -> None:
+    joints_mm = np.random.default_rng(0).normal(0, 300, (14, 3))
+    joints_mm[:, 2] -= joints_mm[[8, 11], 2].mean()
+    ahead = joints_mm + np.array([0, 0, 4000])
+    ahead[:, :2] -= (ahead / np.linalg.norm(ahead, axis=1)[:, None]).mean(0)[:2] * 4000
+    middle = (ahead / np.linalg.norm(ahead, axis=1)[:, None]).mean(0)
+    turn = cv2.Rodrigues(np.array([0.0, 0.4, 0.0]))[0]
+    straight = depths_of({"joints_mm": ahead, "focal_length_px": 500.0})
+    aside = depths_of({"joints_mm": ahead @ turn, "focal_length_px": 500.0})
+    assert abs(middle[:2]).max() < 0.02
+    np.testing.assert_allclose(straight, joints_mm[:, 2] / 4000 * 500, atol=2)
+    np.testing.assert_allclose(aside, straight, atol=1e-3)
+
+
+def test_another_set_s_depths_are_refused(tmp_path: Path) -> None:
+    write_tar(tmp_path / "lspet_x.tar", np.zeros((DEV_LABELLED + 2, 16, 16, 3), np.uint8), 3.0)
+    folder = tmp_path / "depths"
+    folder.mkdir()
+    names = [f"lspet_x{i}.jpg" for i in range(DEV_LABELLED + 2)]
+    np.savez(folder / "lspet_x.npz", image=names, depths_px=np.ones((len(names), 14), np.float32))
+    crops, _ = read_crops(tmp_path, "lspet_x", "", folder)
+    assert all((crop.depths_px == 1).all() for crop in crops)
+    plain, _ = read_crops(tmp_path, "lspet_x", "", tmp_path)
+    assert all(crop.depths_px is None for crop in plain)
+    np.savez(folder / "lspet_x.npz", image=names[1:], depths_px=np.ones((len(names) - 1, 14)))
+    with pytest.raises(AnnotationError, match="depths of another set"):
+        read_crops(tmp_path, "lspet_x", "", folder)
 
 
 def test_the_canonical_view_holds_every_joint() -> None:

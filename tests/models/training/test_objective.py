@@ -10,8 +10,10 @@ from torch import Tensor  # noqa: E402
 
 from library_store.skeleton import LSP14  # noqa: E402
 from models.training.objective import (  # noqa: E402
+    DEPTH_WEIGHT,
     LEFT,
     RIGHT,
+    depth_loss,
     exchanged,
     gaussian_targets,
     total_loss,
@@ -76,3 +78,20 @@ def test_the_whole_loss_falls_from_exchanged_to_right_and_has_gradients() -> Non
         assert torch.isfinite(logits.grad).all()
         losses.append(float(loss.detach()))
     assert losses[1] < losses[0] - 1
+
+
+def test_depths_are_read_where_joints_are_believed_and_unknown_ones_cost_nothing() -> None:
+    joints, trust = people(3)
+    logits = torch.cat([logits_at(joints), torch.zeros(3, 1, CELLS, CELLS)], 1).requires_grad_()
+    depths = torch.linspace(-0.3, 0.3, 14).repeat(3, 1)
+    depths[:, 4] = torch.nan
+    there = (logits_at(joints) > 3).float()
+    maps = (there * torch.nan_to_num(depths)[..., None, None]).requires_grad_()
+    wrong = maps.detach() + 0.1
+    assert depth_loss(maps, logits, depths, trust) < 0.02 * DEPTH_WEIGHT
+    assert depth_loss(wrong, logits, depths, trust) > 0.09 * DEPTH_WEIGHT
+    assert depth_loss(wrong, logits, depths, 0 * trust) == 0
+    depth_loss(maps, logits, depths, trust).backward()
+    assert logits.grad is None
+    assert maps.grad is not None
+    assert not maps.grad[:, 4].any()

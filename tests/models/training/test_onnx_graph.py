@@ -1,5 +1,6 @@
 """The exported graphs compute what the modules do; needs the train extra."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,11 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
+from models.card import PoseOutput  # noqa: E402
 from models.errors import ModelError  # noqa: E402
 from models.session import OnnxModel  # noqa: E402
 from models.training.export import (  # noqa: E402
+    config_of,
     export,
     person_card,
     pose_card,
@@ -62,6 +65,27 @@ def test_pose_graph_equals_its_module(tmp_path: Path) -> None:
     found, expected = outputs(tmp_path / card.file, network, images)
     assert found.shape == (3, 15, 16, 16)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
+
+
+def test_depth_maps_come_after_the_logits_which_stay_as_they_were(tmp_path: Path) -> None:
+    plain = shaken(ConvolutionalPoseMachine(CPM))
+    network = shaken(ConvolutionalPoseMachine(replace(CPM, depths=True)))
+    network.load_state_dict(plain.state_dict(), strict=False)
+    card = publish(pose_model(network, 64), pose_card(network, "tiny", "1", 64), tmp_path)
+    assert isinstance(card.output, PoseOutput)
+    assert card.output.depths
+    assert config_of(read_weights(tmp_path / card.file)) == network.cfg
+    images = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3)).astype(np.uint8)
+    found, expected = outputs(tmp_path / card.file, plain, images)
+    assert found.shape == (2, 29, 16, 16)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(found[:, :15], expected, rtol=1e-4, atol=1e-4 * scale)
+    with torch.no_grad():
+        maps = network.depths(
+            network.seen(torch.from_numpy(images).permute(0, 3, 1, 2).float() / 127.5 - 1)
+        ).numpy()
+    raised = maps.repeat(2, axis=2).repeat(2, axis=3)
+    np.testing.assert_allclose(found[:, 15:], raised, rtol=1e-4, atol=1e-4 * np.abs(maps).max())
 
 
 @pytest.mark.parametrize("shape", [(1, 64, 96, 3), (2, 96, 32, 3)])
