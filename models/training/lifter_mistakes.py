@@ -1,7 +1,8 @@
 """What pose networks get wrong, for the lifter to learn.
 
 On photos joints are not noisy but now and then elsewhere: on the other leg, exchanged with the
-other side, on somebody else. The network's confidence tells something of it. Rendered people
+other side, on somebody else. The network's confidence tells something of it; some networks also
+say how deep the joints lie, and that is wrong in ways of its own. Rendered people
 (``models.training.rendered``) have the truth in 3D. This program has a pose network find their
 joints and keeps both:
 
@@ -14,7 +15,7 @@ with the mistakes of whoever of these is seen most like them.
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -38,6 +39,8 @@ SHIFT, GROWTH = 0.03, 0.08
 """Deviation of boxes from the true ones: of their place, in their longer side, and log size."""
 CANDIDATES = 512
 """Among so many of the known people, drawn at random, the one seen most alike is looked for."""
+NO_HINTS = 0.2
+"""Share of people whose depths are kept from the lifter, so that it can do without them."""
 _ON_ANOTHER, _NEARER = 0.35, 0.5
 """A joint counts as put on another one when it lies so many radii from the own one, and at less
 than such a share of that from the other."""
@@ -49,17 +52,25 @@ class Mistakes:
     """People (n) as a pose network found them.
 
     ``found`` and ``truth`` (n, 14, 2) normalised image coordinates, ``confidence`` (n, 14),
-    ``joints_mm`` (n, 14, 3) in the camera frame.
+    ``joints_mm`` (n, 14, 3) in the camera frame; ``depths`` (n, 14) as the network read them off
+    the picture, relative to the hips' (``z / z_root - 1``, the camera turned onto the person), nan
+    if it reads none.
     """
 
     found: Floats
     confidence: Floats
     truth: Floats
     joints_mm: Floats
+    depths: Floats
 
     def __len__(self) -> int:
         """How many people."""
         return len(self.found)
+
+    @property
+    def have_depths(self) -> bool:
+        """Whether the network read depths."""
+        return bool(np.isfinite(self.depths).any())
 
     def write(self, path: Path) -> None:
         """As one npz."""
@@ -67,10 +78,15 @@ class Mistakes:
 
     @staticmethod
     def read(path: Path) -> Mistakes:
-        """What ``write`` wrote; ``AnnotationError`` for any other file."""
+        """What ``write`` wrote; ``AnnotationError`` for any other file.
+
+        Files from before pose networks read depths have none.
+        """
         try:
             with path.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
-                return Mistakes(*(data[name] for name in Mistakes.__dataclass_fields__))
+                columns = dict(data)
+            columns.setdefault("depths", np.full_like(columns["confidence"], np.nan))
+            return Mistakes(**columns)
         except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
             raise AnnotationError(f"{path} is not what lifter_mistakes wrote: {error}") from error
 
@@ -79,10 +95,13 @@ class Mistakes:
         who = rng.integers(len(self), size=n)
         flip = rng.random(n) < 0.5
         found, confidence, joints = self.found[who], self.confidence[who], self.joints_mm[who]
+        depths = self.depths[who]
         found[flip] = (found[flip] * IN_MIRROR[:2])[:, _MIRROR]
         joints[flip] = (joints[flip] * IN_MIRROR)[:, _MIRROR]
         confidence[flip] = confidence[flip][:, _MIRROR]
-        return _samples(found, confidence, joints)
+        depths[flip] = depths[flip][:, _MIRROR]
+        samples = _samples(found, confidence, joints)
+        return _hinted(samples, depths, rng) if self.have_depths else samples
 
 
 class Transplanter:
@@ -90,20 +109,26 @@ class Transplanter:
 
     Mistakes are kept as shapes, joints less their mean over their RMS radius: a joint that was put
     on another one of the person goes to that one of the receiver, and what is left of the error is
-    added in units of the radius.
+    added in units of the radius. So it is with depths.
     """
 
     def __init__(self, mistakes: Mistakes) -> None:
         truth, centre, radius = _shape(mistakes.truth)
         found = (mistakes.found - centre) / radius
         self._truth = _with_mirror(truth)
-        self._confidence = np.concatenate([mistakes.confidence, mistakes.confidence[:, _MIRROR]])
+        self._confidence = _with_mirror(mistakes.confidence)
         found = _with_mirror(found)
         apart = np.linalg.norm(found[:, :, None] - self._truth[:, None], axis=-1)
         own, nearest = apart.diagonal(axis1=1, axis2=2), apart.argmin(-1)
         elsewhere = (own > _ON_ANOTHER) & (apart.min(-1) < _NEARER * own)
         self._onto = np.where(elsewhere, nearest, np.arange(LSP14.n_joints))
         self._rest = found - np.take_along_axis(self._truth, self._onto[..., None], 1)
+        people = _samples(mistakes.found, mistakes.confidence, mistakes.joints_mm)
+        depths, read = (
+            _with_mirror(part / radius[..., 0]) for part in (people.depths, mistakes.depths)
+        )
+        self._depth_rest = read - np.take_along_axis(depths, self._onto, 1)
+        self._have_depths = mistakes.have_depths
 
     def samples(self, poses_mm: Floats, n: int, rng: np.random.Generator) -> Samples:
         """``n`` people in poses (P, 14, 3) of the prior, badly found."""
@@ -114,12 +139,24 @@ class Transplanter:
         apart2 = (flat**2).sum(1) - 2 * shape.reshape(n, -1) @ flat.T
         like = known[apart2.argmin(1)]
         found = np.take_along_axis(shape, self._onto[like, :, None], 1) + self._rest[like]
-        return _samples(found * radius + centre, self._confidence[like], joints_mm)
+        samples = _samples(found * radius + centre, self._confidence[like], joints_mm)
+        if not self._have_depths:
+            return samples
+        there = np.take_along_axis(samples.depths, self._onto[like], 1)
+        return _hinted(samples, there + self._depth_rest[like] * radius[..., 0], rng)
 
 
 def _samples(found: Floats, confidence: Floats, joints_mm: Floats) -> Samples:
     present = (confidence >= LEAST_CONFIDENCE).astype(np.float32)
     return samples_of(found.astype(np.float32), present, 1 - confidence, joints_mm)
+
+
+def _hinted(samples: Samples, depths: Floats, rng: np.random.Generator) -> Samples:
+    """With depths (n, 14) read off the picture: of joints that are there, and not of everybody."""
+    heard = rng.random((len(depths), 1)) >= NO_HINTS
+    known = heard & np.isfinite(depths) & (samples.present > 0)
+    hint = np.where(known, depths, 0.0).astype(np.float32)
+    return replace(samples, hint=hint, known=known.astype(np.float32))
 
 
 def _shape(points: Floats) -> tuple[Floats, Floats, Floats]:
@@ -129,8 +166,10 @@ def _shape(points: Floats) -> tuple[Floats, Floats, Floats]:
     return (points - centre) / radius, centre, radius
 
 
-def _with_mirror(shapes: Floats) -> Floats:
-    return np.concatenate([shapes, (shapes * IN_MIRROR[:2])[:, _MIRROR]])
+def _with_mirror(values: Floats) -> Floats:
+    """And those of the people in the mirror: of shapes (n, 14, 2), or a value a joint (n, 14)."""
+    mirrored = values * IN_MIRROR[:2] if values.ndim == 3 else values
+    return np.concatenate([values, mirrored[:, _MIRROR]])
 
 
 def find(renders: list[Path], estimator: PoseEstimator, rng: np.random.Generator) -> Mistakes:
@@ -156,7 +195,11 @@ def find(renders: list[Path], estimator: PoseEstimator, rng: np.random.Generator
                 continue
             centre, focal = np.array(record["principal_point_px"]), record["focal_length_px"]
             normal = [(px - centre) / focal for px in (found.positions_px, truth_px)]
-            rows.append((normal[0], found.belief, normal[1], np.array(record["joints_mm"])))
+            depths = np.full(LSP14.n_joints, np.nan)
+            if found.depths_px is not None:
+                depths = found.depths_px / focal
+            joints_mm = np.array(record["joints_mm"])
+            rows.append((normal[0], found.belief, normal[1], joints_mm, depths))
     if not rows:
         raise AnnotationError(f"nobody is found in {', '.join(str(path) for path in renders)}")
     return Mistakes(*(np.array(part, np.float32) for part in zip(*rows, strict=True)))

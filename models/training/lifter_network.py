@@ -8,6 +8,11 @@ and the RMS radius of the present joints in normalised image coordinates.
     f = ((x - c) / r, present, log r, doubt);
     h₀ = relu(W f);   h ← h + V relu(U h / rms(h)) per block
 
+Where the pose network reads depths off the picture, its hints ``z / z_root - 1`` are features too,
+in units of r, with a mask of the joints it gives any for:
+
+    f = (…, hint / r, known)
+
 Of the last layer: where the joints really are in the image, as a correction in units of r; depths
 about the root's, ``z / z_root - 1``, in units of r; the logarithm of the body's radius in mm,
 ``log(r z_root)``; and the logarithms of the standard deviations of all these, one for both image
@@ -44,6 +49,7 @@ _BYTES, _SCALE = ".bytes", ".scale"
 _WEIGHT_LEVELS = 63
 """Of 8-bit weights to either side of 0: with 7 bits no CPU's 16-bit sums of products overflow."""
 N_FEATURES = 4 * N + 1
+N_FEATURES_WITH_DEPTHS = N_FEATURES + 2 * N
 _IMAGE, _DEPTH = slice(0, 2 * N), slice(2 * N, 3 * N)
 _SIZE = 3 * N
 _ACROSS, _ALONG = slice(3 * N + 1, 4 * N + 1), slice(4 * N + 1, 5 * N + 1)
@@ -51,11 +57,14 @@ _SIZE_SIGMA = 5 * N + 1
 
 
 class PoseMlp(nn.Module):
-    """Features (N, 57) -> the last layer (N, 72), float32; see the module."""
+    """Features (N, 85) -> the last layer (N, 72), float32; see the module.
 
-    def __init__(self, width: int = 512, n_blocks: int = 3) -> None:
+    One that reads no depths takes the first 57 of them and looks at no others.
+    """
+
+    def __init__(self, width: int = 512, n_blocks: int = 3, *, reads_depths: bool = False) -> None:
         super().__init__()
-        self.first = nn.Linear(N_FEATURES, width)
+        self.first = nn.Linear(N_FEATURES_WITH_DEPTHS if reads_depths else N_FEATURES, width)
         self.blocks = nn.ModuleList(
             nn.ModuleList((nn.Linear(width, width), nn.Linear(width, width)))
             for _ in range(n_blocks)
@@ -68,14 +77,19 @@ class PoseMlp(nn.Module):
             for block in self.blocks:
                 block[1].weight.mul_(0.1)
                 nn.init.zeros_(block[1].bias)
-            self.first.weight[:, 3 * N + 1 :] = 0.0  # doubt is heeded once it is learned
+            self.first.weight[:, 3 * N + 1 :] = 0.0  # doubt and hints are heeded once learned
             nn.init.zeros_(self.last.weight)
             nn.init.zeros_(self.last.bias)
             self.last.bias[_SIZE + 1 :] = -2.0
 
+    @property
+    def reads_depths(self) -> bool:
+        """Whether it takes depths that a pose network read off the picture."""
+        return self.first.in_features == N_FEATURES_WITH_DEPTHS
+
     def forward(self, features: Tensor) -> Tensor:
         """The last layer is computed in single precision whatever the rest is computed in."""
-        hidden = torch.relu(self.first(features))
+        hidden = torch.relu(self.first(features[:, : self.first.in_features]))
         for block in self.blocks:
             hidden = hidden + block[1](torch.relu(block[0](_unit(hidden))))
         with torch.autocast(hidden.device.type, enabled=False):
@@ -86,10 +100,25 @@ def _unit(hidden: Tensor) -> Tensor:
     return hidden * torch.rsqrt((hidden * hidden).mean(1, keepdim=True) + _RMS_FLOOR)
 
 
-def normalised(points: Tensor, present: Tensor, doubt: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Features (N, 57), c (N, 1, 2), r (N, 1, 1).
+def with_depths(network: PoseMlp) -> PoseMlp:
+    """The network widened, if need be, to read depths: to start with it does not heed them."""
+    if network.reads_depths:
+        return network
+    wider = PoseMlp(network.first.out_features, len(network.blocks), reads_depths=True)
+    parts = network.state_dict()
+    weight = parts["first.weight"]
+    parts["first.weight"] = functional.pad(weight, (0, N_FEATURES_WITH_DEPTHS - N_FEATURES))
+    wider.load_state_dict(parts)
+    return wider
 
-    Of points (N, 14, 2), their mask (N, 14) and the doubt in them (N, 14).
+
+def normalised(
+    points: Tensor, present: Tensor, doubt: Tensor, hint: Tensor, known: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Features (N, 85), c (N, 1, 2), r (N, 1, 1).
+
+    Of points (N, 14, 2), their mask, the doubt in them, hints of their depths and the mask of
+    these, each (N, 14). What is not known, or of joints that are missing, counts as 0.
     """
     shares = (present / present.sum(1, keepdim=True))[..., None]
     centre = (shares * points).sum(1, keepdim=True)
@@ -97,7 +126,9 @@ def normalised(points: Tensor, present: Tensor, doubt: Tensor) -> tuple[Tensor, 
     radius = torch.sqrt((shares * centred**2).sum((1, 2), keepdim=True) + _TINY)
     shape = (centred / radius).flatten(1)
     log_radius = radius.log()[:, 0] - LOG_RADIUS
-    return torch.cat([shape, present, log_radius, doubt], 1), centre, radius
+    known = known * present
+    depth = hint * known / radius[:, 0]
+    return torch.cat([shape, present, log_radius, doubt, depth, known], 1), centre, radius
 
 
 @dataclass(frozen=True)
@@ -152,7 +183,7 @@ def losses(last: Tensor, image: Tensor, depths: Tensor, log_size: Tensor) -> tup
 def read_network(path: Path) -> PoseMlp:
     """The network that ``lifter_model`` wrote, to go on from; hidden weights as they were rounded.
 
-    Raises ``ModelError`` for any other file.
+    With depths or without, as it was. Raises ``ModelError`` for any other file.
     """
     try:
         stored = {
@@ -163,7 +194,9 @@ def read_network(path: Path) -> PoseMlp:
         for name in [name for name in stored if name.endswith(_BYTES)]:
             whole = name.removesuffix(_BYTES)
             stored[whole] = (stored.pop(name) * stored.pop(whole + _SCALE)).T
-        network = PoseMlp(len(stored["first.bias"]), sum(".0.bias" in name for name in stored))
+        width, n_features = stored["first.weight"].shape
+        n_blocks = sum(".0.bias" in name for name in stored)
+        network = PoseMlp(width, n_blocks, reads_depths=n_features > N_FEATURES)
         parts = {name: torch.tensor(value.astype(np.float32)) for name, value in stored.items()}
         network.load_state_dict(parts)
     except Exception as error:  # a reader of foreign bytes fails in every way
@@ -176,7 +209,8 @@ def lifter_model(network: PoseMlp, moments: NDArray[np.float64]) -> onnx.ModelPr
 
     Joints (n, 14, 3), x and y in normalised image coordinates and how probably they are right (0
     for missing ones), to (n, 43, 42): a state (x, y of each joint, then the depths) and the
-    covariance of its errors.
+    covariance of its errors. Of a network that reads depths, joints (n, 14, 5): then come the depth
+    read off the picture, ``z / z_root - 1``, and 1 where it is known, 0 where not.
     Each person is seen in a mirror too and the two answers averaged, so that left and right are
     the same to it.
 
@@ -187,6 +221,7 @@ def lifter_model(network: PoseMlp, moments: NDArray[np.float64]) -> onnx.ModelPr
     """
     w = GraphWriter(network)
     mirror = np.array(LSP14.mirror)
+    n_given = 5 if network.reads_depths else 3
 
     def number(value: float) -> str:
         return w.constant(np.array(value, np.float32))
@@ -213,7 +248,7 @@ def lifter_model(network: PoseMlp, moments: NDArray[np.float64]) -> onnx.ModelPr
         return w.node("Mul", w.node("Add", plain, back), number(0.5))
 
     flipped = w.node("Gather", "joints", w.constant(mirror), axis=1)
-    flipped = w.node("Mul", flipped, w.constant(np.array([-1, 1, 1], np.float32)))
+    flipped = w.node("Mul", flipped, w.constant(np.array([-1, 1, 1, 1, 1][:n_given], np.float32)))
     both = w.node("Concat", "joints", flipped, axis=0)
     points, belief = cut(both, 0, 2, 2), cut(both, 2, 3, 2)
     present = w.node("Cast", w.node("Greater", belief, number(0.0)), to=onnx.TensorProto.FLOAT)
@@ -252,7 +287,12 @@ def lifter_model(network: PoseMlp, moments: NDArray[np.float64]) -> onnx.ModelPr
         square = w.node("ReduceMean", w.node("Mul", value, value), axes=[1], keepdims=1)
         return w.node("Div", value, w.node("Sqrt", w.node("Add", square, number(_RMS_FLOOR))))
 
-    features = w.node("Concat", shape, mask, log_radius, doubt, axis=1)
+    parts = [shape, mask, log_radius, doubt]
+    if network.reads_depths:
+        known = w.node("Mul", cut(both, 4, 5, 2), present)
+        hint = w.node("Div", w.node("Mul", cut(both, 3, 4, 2), known), radius)
+        parts += [w.node("Reshape", part, w.shape(-1, N)) for part in (hint, known)]
+    features = w.node("Concat", *parts, axis=1)
     hidden = w.node("Relu", linear(features, network.first))
     for inner, outer in network.blocks:  # type: ignore[misc]
         step = w.node("Relu", linear_in_8_bits(unit(hidden), inner))
@@ -287,7 +327,7 @@ def lifter_model(network: PoseMlp, moments: NDArray[np.float64]) -> onnx.ModelPr
     state = w.node("Reshape", state, w.shape(-1, 1, 3 * N))
     return w.model(
         w.node("Concat", state, covariance, axis=1),
-        ("n", N, 3),
+        ("n", N, n_given),
         ("n", 1 + 3 * N, 3 * N),
         kind=onnx.TensorProto.FLOAT,
         names=("joints", "answer"),

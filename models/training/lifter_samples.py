@@ -38,13 +38,16 @@ class Samples:
 
     ``points`` (n, 14, 2) normalised image coordinates, 0 where missing; ``present`` (n, 14);
     ``doubt`` (n, 14) how probably a present joint is elsewhere, as a pose network would say;
-    ``truth`` (n, 14, 2) where they really are; ``depths`` (n, 14) relative to the hip midpoint's,
-    ``z / z_root - 1``; ``root_mm`` (n,) its depth.
+    ``hint`` (n, 14) what it read off the picture of ``depths``, 0 where it said nothing, and
+    ``known`` (n, 14) where it did; ``truth`` (n, 14, 2) where they really are; ``depths`` (n, 14)
+    relative to the hip midpoint's, ``z / z_root - 1``; ``root_mm`` (n,) its depth.
     """
 
     points: Floats
     present: Floats
     doubt: Floats
+    hint: Floats
+    known: Floats
     truth: Floats
     depths: Floats
     root_mm: Floats
@@ -65,7 +68,10 @@ def draw(poses_mm: Floats, n: int, rng: np.random.Generator) -> Samples:
 
 
 def samples_of(points: Floats, present: Floats, doubt: Floats, joints_mm: Floats) -> Samples:
-    """Samples of people (n, 14, 3) mm before the camera, whose joints were seen at ``points``."""
+    """Samples of people (n, 14, 3) mm before the camera, whose joints were seen at ``points``.
+
+    Of their depths the picture said nothing.
+    """
     turn, rays = _onto_axis(points, present)
     turned, truth = rays @ turn, joints_mm @ turn
     depth = _root_depth(truth)
@@ -73,6 +79,8 @@ def samples_of(points: Floats, present: Floats, doubt: Floats, joints_mm: Floats
         points=turned[..., :2] / turned[..., 2:] * present[..., None],
         present=present,
         doubt=doubt * present,
+        hint=np.zeros_like(present),
+        known=np.zeros_like(present),
         truth=truth[..., :2] / truth[..., 2:],
         depths=truth[..., 2] / depth[:, None] - 1.0,
         root_mm=depth,
@@ -87,6 +95,8 @@ def in_mirror(samples: Samples) -> Samples:
         points=(samples.points * IN_MIRROR[:2])[:, order],
         present=samples.present[:, order],
         doubt=samples.doubt[:, order],
+        hint=samples.hint[:, order],
+        known=samples.known[:, order],
     )
 
 

@@ -2,9 +2,9 @@
 
 It learns from the pose prior (``library_store.prior_data``; ``--prior`` for another), which needs
 nothing but what is in the repository; then, by ``--init`` of what that made and ``--mistakes`` of
-``models.training.lifter_mistakes``, from what a pose network gets wrong. Twenty minutes of one core
-for the first, eight for the second; the rate of learning falls to nothing over ``--minutes`` of
-wall time, and an average of the weights is kept.
+``models.training.lifter_mistakes``, from what a pose network gets wrong, and to read depths if that
+network does. Twenty minutes of one core for the first, eight for the second; the rate of learning
+falls to nothing over ``--minutes`` of wall time, and an average of the weights is kept.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from models.training.lifter_network import (
     normalised,
     read_last,
     read_network,
+    with_depths,
 )
 from models.training.lifter_samples import Floats, Samples, draw, in_mirror, joined
 from models.training.precision import has_bf16
@@ -70,14 +71,25 @@ def drawing(poses_mm: Floats, mistakes: Mistakes | None) -> Draw:
 
 
 def train(
-    drawn: Draw, minutes: float, seed: int, *, rate: float = RATE, start: PoseMlp | None = None
+    drawn: Draw,
+    minutes: float,
+    seed: int,
+    *,
+    rate: float = RATE,
+    start: PoseMlp | None = None,
+    depths: bool = False,
 ) -> tuple[PoseMlp, int]:
-    """The averaged network after so long, and how many samples it has seen."""
+    """The averaged network after so long, and how many samples it has seen.
+
+    ``depths``: the samples have hints of them, and ``start`` is widened to read these.
+    """
     rng = np.random.default_rng(seed)
     torch.manual_seed(seed)
     torch.set_num_threads(1)
     bf16 = has_bf16("cpu")
     network = PoseMlp() if start is None else start
+    if depths:
+        network = with_depths(network)
     average = copy.deepcopy(network)
     optimiser = torch.optim.AdamW(
         network.parameters(), lr=rate, betas=(0.9, 0.99), weight_decay=0.01, fused=True
@@ -121,10 +133,10 @@ def train(
 
 def tensors(samples: Samples) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Features, and what the last layer should say of them: see ``lifter_network.losses``."""
-    points, present, doubt, truth, depths, root_mm = (
+    points, present, doubt, hint, known, truth, depths, root_mm = (
         torch.from_numpy(np.ascontiguousarray(part, np.float32)) for part in vars(samples).values()
     )
-    features, centre, radius = normalised(points, present, doubt)
+    features, centre, radius = normalised(points, present, doubt, hint, known)
     given = (points - centre) / radius * present[..., None]
     log_size = torch.log(radius[:, 0, 0] * root_mm) - LOG_SIZE
     return features, (truth - centre) / radius - given, depths / radius[:, 0], log_size
@@ -189,6 +201,7 @@ def lifter_card(
             kind="lift",
             joint_names=list(LSP14.joint_names),
             reads_confidence=mistaken,
+            reads_depths=network.reads_depths,
             found=found,
         ),
         training_data=[
@@ -225,9 +238,14 @@ def main() -> None:
     rng = np.random.default_rng(chosen.seed)
     poses = prior.sample(POOL, rng).astype(np.float32)
     mistakes = None if chosen.mistakes is None else Mistakes.read(chosen.mistakes)
+    depths = mistakes is not None and mistakes.have_depths
     start = None if chosen.init is None else read_network(chosen.init)
+    if start is not None and start.reads_depths and not depths:
+        parser.error(f"{chosen.init} reads depths: go on from it by --mistakes that have them")
     drawn = drawing(poses, mistakes)
-    network, n = train(drawn, chosen.minutes, chosen.seed, rate=chosen.rate, start=start)
+    network, n = train(
+        drawn, chosen.minutes, chosen.seed, rate=chosen.rate, start=start, depths=depths
+    )
     measured: dict[str, float | str] = {
         "samples": float(n),
         "prior_sha256": prior.sha256,

@@ -2,18 +2,24 @@
 
 import json
 import shutil
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from library_store.prior import PosePrior
-from library_store.skeleton import L_ANKLE, LSP14, R_ANKLE
+from library_store.skeleton import L_ANKLE, L_KNEE, LSP14, R_ANKLE, R_KNEE
 from models import PoseEstimator
 from models.errors import AnnotationError
+from models.heatmaps import Joints2D
+from models.person_detector import PersonBox
+from models.training import lifter_mistakes
 from models.training.lifter_mistakes import Mistakes, Transplanter, find
-from models.training.lifter_samples import Floats, seen_people
+from models.training.lifter_samples import Floats, Samples, samples_of, seen_people
 
 RENDERS = Path("tests/data/renders")
 
@@ -40,8 +46,12 @@ def rendered(folder: Path, *, truth: bool = True) -> Path:
     return folder
 
 
-def mistaken(n: int = 60) -> Mistakes:
-    """People in mid-stride whose right ankle was put on the left one, without much confidence."""
+def mistaken(n: int = 60, *, depths: bool = False) -> Mistakes:
+    """People in mid-stride whose right ankle was put on the left one, without much confidence.
+
+    ``depths``: by a network that also reads them, with no error but that it takes the one ankle's
+    for the other's.
+    """
     poses = PosePrior.load().sample(200, np.random.default_rng(4)).astype(np.float32)
     joints = seen_people(poses, 10 * n, np.random.default_rng(5))
     truth = joints[..., :2] / joints[..., 2:]
@@ -50,16 +60,46 @@ def mistaken(n: int = 60) -> Mistakes:
     joints, truth = (part[np.argsort(-stride)[:n]] for part in (joints, truth))
     found, confidence = truth.copy(), np.full((n, 14), 0.95, np.float32)
     found[:, R_ANKLE], confidence[:, R_ANKLE] = truth[:, L_ANKLE], 0.4
-    return Mistakes(found, confidence, truth, joints)
+    read = np.full((n, 14), np.nan, np.float32)
+    if depths:
+        read = samples_of(found, np.ones_like(confidence), 1 - confidence, joints).depths
+        read[:, R_ANKLE] = read[:, L_ANKLE]
+    return Mistakes(found, confidence, truth, joints, read)
 
 
-def test_mistakes_are_kept_whole(tmp_path: Path) -> None:
-    mistakes = mistaken()
+def radii(samples: Samples) -> Floats:
+    """Of people (n, 14): one a person, in the view of the camera turned onto them."""
+    off = samples.truth - samples.truth.mean(1, keepdims=True)
+    return np.repeat(np.sqrt((off**2).sum(2).mean(1))[:, None], 14, 1)
+
+
+class ReadsDepths(PoseEstimator):
+    """The network that ships, as if each joint were read to lie a step farther than the last."""
+
+    def estimate(self, image: NDArray[np.uint8], boxes: Sequence[PersonBox]) -> list[Joints2D]:
+        steps_px = np.arange(14.0)
+        return [replace(found, depths_px=steps_px) for found in super().estimate(image, boxes)]
+
+
+@pytest.mark.parametrize("depths", [False, True])
+def test_mistakes_are_kept_whole(tmp_path: Path, *, depths: bool) -> None:
+    mistakes = mistaken(depths=depths)
+    assert mistakes.have_depths == depths
     mistakes.write(tmp_path / "mistakes.npz")
     again = Mistakes.read(tmp_path / "mistakes.npz")
     assert len(again) == 60
     for name, value in vars(mistakes).items():
         np.testing.assert_array_equal(getattr(again, name), value)
+
+
+def test_files_from_before_depths_were_read_have_none(tmp_path: Path) -> None:
+    columns = vars(mistaken(depths=True))
+    del columns["depths"]
+    np.savez(tmp_path / "before.npz", **columns)
+    again = Mistakes.read(tmp_path / "before.npz")
+    assert not again.have_depths
+    assert np.isnan(again.depths).all()
+    assert again.depths.shape == (60, 14)
 
 
 def test_other_files_hold_no_mistakes(tmp_path: Path) -> None:
@@ -107,6 +147,58 @@ def test_joints_that_hardly_anything_says_are_missing() -> None:
     assert (samples.doubt[missing] == 0).all()
 
 
+def test_a_depth_read_without_error_is_the_receiver_s_own(
+    poses: Floats, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lifter_mistakes, "NO_HINTS", 0.0)
+    mistakes = mistaken(depths=True)
+    rng = np.random.default_rng(6)
+    for samples in (Transplanter(mistakes).samples(poses, 400, rng), mistakes.people(400, rng)):
+        assert (samples.known == 1).all()
+        # But for the one ankle: it lies where it was put, as deep as the other.
+        ankles = np.array([R_ANKLE, L_ANKLE])
+        wrong = samples.doubt[:, ankles] > 0.5
+        assert 0.3 < wrong[:, 0].mean() < 0.7
+        there = samples.depths[:, ankles[::-1]]
+        np.testing.assert_allclose(samples.hint[:, ankles][wrong], there[wrong], atol=1e-4)
+        right = np.ones_like(samples.present, bool)
+        right[:, ankles] = ~wrong
+        np.testing.assert_allclose(samples.hint[right], samples.depths[right], atol=1e-4)
+
+
+def test_errors_of_depths_are_as_large_as_the_person_is_and_the_same_in_the_mirror(
+    poses: Floats, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lifter_mistakes, "NO_HINTS", 0.0)
+    mistakes = mistaken(depths=True)
+    centred = mistakes.truth - mistakes.truth.mean(1, keepdims=True)
+    mistakes.depths[:, R_KNEE] += 0.5 * np.sqrt((centred**2).sum(2).mean(1))
+    samples = Transplanter(mistakes).samples(poses, 400, np.random.default_rng(6))
+    off = ((samples.hint - samples.depths) / radii(samples))[:, [R_KNEE, L_KNEE]]
+    assert 0.3 < (off[:, 0] > off[:, 1]).mean() < 0.7
+    np.testing.assert_allclose(off.max(1), 0.5, atol=0.05)
+    np.testing.assert_allclose(off.min(1), 0.0, atol=1e-3)
+
+
+def test_depths_of_missing_joints_and_of_some_people_are_not_known(poses: Floats) -> None:
+    mistakes = mistaken(depths=True)
+    mistakes.confidence[:, R_ANKLE] = 0.1
+    rng = np.random.default_rng(6)
+    for samples in (Transplanter(mistakes).samples(poses, 2000, rng), mistakes.people(2000, rng)):
+        heard = samples.known.any(1)
+        assert heard.mean() == pytest.approx(1 - lifter_mistakes.NO_HINTS, abs=0.05)
+        np.testing.assert_array_equal(samples.known[heard], samples.present[heard])
+        assert (samples.hint[samples.known == 0] == 0).all()
+
+
+def test_who_reads_no_depths_gives_no_hints(poses: Floats) -> None:
+    rng = np.random.default_rng(6)
+    mistakes = mistaken()
+    for samples in (Transplanter(mistakes).samples(poses, 50, rng), mistakes.people(50, rng)):
+        assert not samples.known.any()
+        assert not samples.hint.any()
+
+
 def test_a_network_s_joints_are_kept_beside_the_truth(tmp_path: Path) -> None:
     folder = rendered(tmp_path)
     mistakes = find([folder], PoseEstimator("cpm"), np.random.default_rng(0))
@@ -118,6 +210,15 @@ def test_a_network_s_joints_are_kept_beside_the_truth(tmp_path: Path) -> None:
     assert np.median(off) < 0.15
     sure = mistakes.confidence > 0.8
     assert off[sure].mean() < off[~sure].mean()
+    assert not mistakes.have_depths
+
+
+def test_depths_are_kept_relative_to_the_hips(tmp_path: Path) -> None:
+    folder = rendered(tmp_path)
+    mistakes = find([folder], ReadsDepths("cpm"), np.random.default_rng(0))
+    images = json.loads((RENDERS / "ground_truth.json").read_text())["images"]
+    focal_px = np.array([[image["K"][0][0]] for image in images])
+    np.testing.assert_allclose(mistakes.depths * focal_px, [np.arange(14.0)] * len(images))
 
 
 def test_sets_without_the_truth_in_3d_are_refused(tmp_path: Path) -> None:
