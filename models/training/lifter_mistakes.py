@@ -31,7 +31,14 @@ from models.errors import AnnotationError
 from models.person_detector import PersonBox
 from models.pose_estimator import PoseEstimator
 from models.training.dataset import decode_members, read_annotations
-from models.training.lifter_samples import IN_MIRROR, Floats, Samples, samples_of, seen_people
+from models.training.lifter_samples import (
+    IN_MIRROR,
+    Floats,
+    Samples,
+    relative_depths,
+    samples_of,
+    seen_people,
+)
 
 LEAST_CONFIDENCE, LEAST_JOINTS = 0.2, 6
 """Joints of less confidence count as missing, as in the service; people with fewer are left out."""
@@ -39,6 +46,8 @@ SHIFT, GROWTH = 0.03, 0.08
 """Deviation of boxes from the true ones: of their place, in their longer side, and log size."""
 CANDIDATES = 512
 """Among so many of the known people, drawn at random, the one seen most alike is looked for."""
+CANDIDATES_IN_DEPTH = 2048
+"""Among so many if they must also lie alike in depth."""
 NO_HINTS = 0.2
 """Share of people whose depths are kept from the lifter, so that it can do without them."""
 _ON_ANOTHER, _NEARER = 0.35, 0.5
@@ -109,7 +118,9 @@ class Transplanter:
 
     Mistakes are kept as shapes, joints less their mean over their RMS radius: a joint that was put
     on another one of the person goes to that one of the receiver, and what is left of the error is
-    added in units of the radius. So it is with depths.
+    added in units of the radius. So it is with depths; they then also tell who is like whom. Read
+    off a picture depths err towards 0 or to the other side: that error, carried over to someone
+    whose limb points the other way, would make hints that mislead too seldom.
     """
 
     def __init__(self, mistakes: Mistakes) -> None:
@@ -123,20 +134,26 @@ class Transplanter:
         elsewhere = (own > _ON_ANOTHER) & (apart.min(-1) < _NEARER * own)
         self._onto = np.where(elsewhere, nearest, np.arange(LSP14.n_joints))
         self._rest = found - np.take_along_axis(self._truth, self._onto[..., None], 1)
-        people = _samples(mistakes.found, mistakes.confidence, mistakes.joints_mm)
-        depths, read = (
-            _with_mirror(part / radius[..., 0]) for part in (people.depths, mistakes.depths)
-        )
-        self._depth_rest = read - np.take_along_axis(depths, self._onto, 1)
         self._have_depths = mistakes.have_depths
+        self._seen = self._truth.reshape(len(self._truth), -1)
+        if self._have_depths:
+            people = _samples(mistakes.found, mistakes.confidence, mistakes.joints_mm)
+            depths = _with_mirror(people.depths / radius[..., 0])
+            read = _with_mirror(mistakes.depths / radius[..., 0])
+            self._depth_rest = read - np.take_along_axis(depths, self._onto, 1)
+            self._seen = np.concatenate([self._seen, depths], 1)
 
     def samples(self, poses_mm: Floats, n: int, rng: np.random.Generator) -> Samples:
         """``n`` people in poses (P, 14, 3) of the prior, badly found."""
         joints_mm = seen_people(poses_mm, n, rng)
         shape, centre, radius = _shape(joints_mm[..., :2] / joints_mm[..., 2:])
-        known = rng.choice(len(self._truth), min(CANDIDATES, len(self._truth)), replace=False)
-        flat = self._truth[known].reshape(len(known), -1)
-        apart2 = (flat**2).sum(1) - 2 * shape.reshape(n, -1) @ flat.T
+        seen, candidates = shape.reshape(n, -1), CANDIDATES
+        if self._have_depths:
+            seen = np.concatenate([seen, relative_depths(joints_mm) / radius[..., 0]], 1)
+            candidates = CANDIDATES_IN_DEPTH
+        known = rng.choice(len(self._seen), min(candidates, len(self._seen)), replace=False)
+        flat = self._seen[known]
+        apart2 = (flat**2).sum(1) - 2 * seen @ flat.T
         like = known[apart2.argmin(1)]
         found = np.take_along_axis(shape, self._onto[like, :, None], 1) + self._rest[like]
         samples = _samples(found * radius + centre, self._confidence[like], joints_mm)

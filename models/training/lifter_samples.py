@@ -74,7 +74,6 @@ def samples_of(points: Floats, present: Floats, doubt: Floats, joints_mm: Floats
     """
     turn, rays = _onto_axis(points, present)
     turned, truth = rays @ turn, joints_mm @ turn
-    depth = _root_depth(truth)
     return Samples(
         points=turned[..., :2] / turned[..., 2:] * present[..., None],
         present=present,
@@ -82,8 +81,8 @@ def samples_of(points: Floats, present: Floats, doubt: Floats, joints_mm: Floats
         hint=np.zeros_like(present),
         known=np.zeros_like(present),
         truth=truth[..., :2] / truth[..., 2:],
-        depths=truth[..., 2] / depth[:, None] - 1.0,
-        root_mm=depth,
+        depths=relative_depths(truth),
+        root_mm=_root_depth(truth),
     )
 
 
@@ -104,6 +103,12 @@ def joined(parts: Sequence[Samples]) -> Samples:
     """All samples of all parts, in order."""
     columns = zip(*(vars(part).values() for part in parts), strict=True)
     return Samples(*(np.concatenate(column) for column in columns))
+
+
+def relative_depths(joints_mm: Floats) -> Floats:
+    """Of people (n, 14, 3) before the camera, (n, 14): about the hip midpoint's, in its units."""
+    depths: Floats = joints_mm[..., 2] / _root_depth(joints_mm)[:, None] - 1.0
+    return depths
 
 
 def seen_people(poses_mm: Floats, n: int, rng: np.random.Generator) -> Floats:

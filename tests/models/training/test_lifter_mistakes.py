@@ -180,6 +180,20 @@ def test_errors_of_depths_are_as_large_as_the_person_is_and_the_same_in_the_mirr
     np.testing.assert_allclose(off.min(1), 0.0, atol=1e-3)
 
 
+def test_depths_that_are_understated_are_so_for_others_too(
+    poses: Floats, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lifter_mistakes, "NO_HINTS", 0.0)
+    joints = seen_people(poses, 4000, np.random.default_rng(5))
+    truth, sure = joints[..., :2] / joints[..., 2:], np.ones(joints.shape[:2], np.float32)
+    read = 0.3 * samples_of(truth, sure, 1 - sure, joints).depths
+    mistakes = Mistakes(truth, sure, truth, joints, read)
+    samples = Transplanter(mistakes).samples(poses, 1000, np.random.default_rng(6))
+    # Errors of people who are merely seen alike would overstate most of them.
+    slope = (samples.hint * samples.depths).sum() / (samples.depths**2).sum()
+    assert slope < 0.5
+
+
 def test_depths_of_missing_joints_and_of_some_people_are_not_known(poses: Floats) -> None:
     mistakes = mistaken(depths=True)
     mistakes.confidence[:, R_ANKLE] = 0.1
