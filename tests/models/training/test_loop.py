@@ -43,25 +43,15 @@ def test_input_grows_at_its_share_of_the_run_whatever_the_evaluations(tmp_path: 
 
 
 def test_what_is_added_to_a_network_may_be_new_to_it(tmp_path: Path) -> None:
-    class Old(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.a = torch.nn.Linear(2, 2)
-
-    class New(Old):
-        ADDED = "b."
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.b = torch.nn.Linear(2, 2)
-
-    old, new = Old(), New()
+    old = torch.nn.ModuleDict({"a": torch.nn.Linear(2, 2)})
+    new = torch.nn.ModuleDict({"a": torch.nn.Linear(2, 2), "b": torch.nn.Linear(2, 2)})
+    new.ADDED = "b."
     torch.save({"ema": old.state_dict(), "config": {}, "step": 1}, tmp_path / "old.pt")
     loop._start_from(tmp_path / "old.pt", new)
-    assert torch.equal(new.a.weight, old.a.weight)
+    assert torch.equal(new["a"].weight, old["a"].weight)
     torch.save({"ema": new.state_dict(), "config": {}, "step": 1}, tmp_path / "new.pt")
     with pytest.raises(SystemExit, match=r"has .*b\.weight"):
         loop._start_from(tmp_path / "new.pt", old)
-    torch.save({"ema": old.a.state_dict(), "config": {}, "step": 1}, tmp_path / "other.pt")
+    torch.save({"ema": old["a"].state_dict(), "config": {}, "step": 1}, tmp_path / "other.pt")
     with pytest.raises(SystemExit, match=r"lacks .*a\.weight"):
         loop._start_from(tmp_path / "other.pt", new)
