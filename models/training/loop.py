@@ -68,7 +68,8 @@ class Feeder:
         self._make, self._steps = make, steps
         self._queue: queue.Queue[Batch | BaseException] = queue.Queue(4)
         self._closed = threading.Event()
-        threading.Thread(target=self._run, daemon=True).start()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
 
     def _run(self) -> None:
         try:
@@ -87,11 +88,12 @@ class Feeder:
             yield item
 
     def close(self) -> None:
-        """Make no more; what is made and not taken is dropped."""
+        """Make no more; what is made and not taken is dropped, what is being made waited for."""
         self._closed.set()
         with suppress(queue.Empty):
             while True:
                 self._queue.get_nowait()
+        self._thread.join()
 
 
 def _average_into(ema: nn.Module, model: nn.Module, decay: float) -> None:
