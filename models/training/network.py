@@ -137,9 +137,10 @@ class DepthHead(nn.Module):
     def __init__(self, cfg: CpmConfig) -> None:
         super().__init__()
         s = cfg.stage_width
-        self.enter = _conv_bn(2 * s, s, 1)
-        self.body = Residual(s, s)
-        self.score = nn.Conv2d(s, cfg.n_joints, 1)
+        w = s // 2  # half as wide as a stage: a fiftieth of the whole network's work
+        self.enter = _conv_bn(2 * s, w, 1)
+        self.body = Residual(w, w)
+        self.score = nn.Conv2d(w, cfg.n_joints, 1)
         nn.init.zeros_(self.score.weight)
         nn.init.zeros_(self.score.bias)
 
@@ -151,11 +152,10 @@ class DepthHead(nn.Module):
 
 @dataclass(frozen=True)
 class Seen:
-    """What the network makes of crops: logits per stage, and what depths are read from."""
+    """What the network makes of crops: logits per stage, and depth maps if it has any."""
 
     stages: list[Tensor]
-    features: Tensor
-    hidden: Tensor
+    depths: Tensor | None
 
 
 class ConvolutionalPoseMachine(nn.Module):
@@ -185,14 +185,13 @@ class ConvolutionalPoseMachine(nn.Module):
         """(B, 3, H, W) in [-1, 1] -> logits per stage: (B, 15, H/8, W/8) ..., (B, 15, H/4, W/4)."""
         return self.seen(image).stages
 
-    def depths(self, seen: Seen) -> Tensor:
-        """The depth maps (B, 14, H/8, W/8) of a network that has them."""
-        assert self.depth is not None
-        maps: Tensor = self.depth(seen.features, seen.hidden)
-        return maps
+    def seen(self, image: Tensor, *, only_depths: bool = False) -> Seen:
+        """``forward``, and depth maps (B, 14, H/8, W/8); gradients of these alone if so wanted."""
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not only_depths):
+            stages, features, hidden = self._stages(image)
+        return Seen(stages, None if self.depth is None else self.depth(features, hidden))
 
-    def seen(self, image: Tensor) -> Seen:
-        """``forward``, and the features that it came by."""
+    def _stages(self, image: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
         x4, features = self.backbone(image)
         logits: Tensor | None = None
         every: list[Tensor] = []
@@ -204,7 +203,7 @@ class ConvolutionalPoseMachine(nn.Module):
         up = F.interpolate(logits, scale_factor=2.0, mode="bilinear", align_corners=False)
         x = self.fine(F.relu(x4 + _up2(self.fine_low(hidden))))
         every.append(up + self.fine_score(x))
-        return Seen(every, features, hidden)
+        return every, features, hidden
 
 
 @dataclass(frozen=True)

@@ -80,8 +80,8 @@ def measure_depths(
         x, _, weight, _, depths = to_batch([canonical(c, size) for c in crops[start : start + 64]])
         with torch.no_grad(), mixed_precision(device):
             seen = model.seen(x.to(device))
-            maps = model.depths(seen)
-        found = read_depths(maps, seen.stages[-2]).cpu()
+        assert seen.depths is not None
+        found = read_depths(seen.depths, seen.stages[-2]).cpu()
         errors.append((found - depths).abs()[(weight > 0) & torch.isfinite(depths)])
     return float(torch.cat(errors).mean())
 
@@ -129,12 +129,10 @@ def main() -> None:
             assert model.depth is not None
             model.depth.train()
         with mixed_precision(args.device):
-            with torch.set_grad_enabled(not args.only_depths):
-                seen = model.seen(x)
-            maps = model.depths(seen) if cfg.depths else None
-        if maps is None:
+            seen = model.seen(x, only_depths=args.only_depths)
+        if seen.depths is None:
             return total_loss(seen.stages, joints, weight, presence, x.shape[-1])
-        of_depths = depth_loss(maps, seen.stages[-2], depths, weight)
+        of_depths = depth_loss(seen.depths, seen.stages[-2], depths, weight)
         if args.only_depths:
             return of_depths
         return of_depths + total_loss(seen.stages, joints, weight, presence, x.shape[-1])

@@ -81,9 +81,9 @@ def test_depth_maps_come_after_the_logits_which_stay_as_they_were(tmp_path: Path
     scale = np.abs(expected).max()
     np.testing.assert_allclose(found[:, :15], expected, rtol=1e-4, atol=1e-4 * scale)
     with torch.no_grad():
-        maps = network.depths(
-            network.seen(torch.from_numpy(images).permute(0, 3, 1, 2).float() / 127.5 - 1)
-        ).numpy()
+        seen = network.seen(torch.from_numpy(images).permute(0, 3, 1, 2).float() / 127.5 - 1)
+    assert seen.depths is not None
+    maps = seen.depths.numpy()
     raised = maps.repeat(2, axis=2).repeat(2, axis=3)
     np.testing.assert_allclose(found[:, 15:], raised, rtol=1e-4, atol=1e-4 * np.abs(maps).max())
 
