@@ -47,7 +47,7 @@ class PoseOutput(_Frozen):
     maps: Literal["logits", "beliefs"]
     border_grey: int = Field(0, ge=0, le=255, description="what crops have beyond the photo's edge")
     depths: bool = Field(
-        False, description="then maps of the joints' depths less the hips', over the crop's side"
+        False, description="a second output: joints' depths less the hips', over the crop's side"
     )
     looks: Literal[1, 2, 3] = Field(1, description="how often a doubtful crop is looked at")
     confidence: ConfidenceCalibration | None = None
@@ -60,12 +60,6 @@ class PoseOutput(_Frozen):
         return self
 
     @model_validator(mode="after")
-    def _depths_go_with_logits(self) -> Self:
-        if self.depths and self.maps != "logits":
-            raise ValueError(f"depths are read beside logits, not beside {self.maps}")
-        return self
-
-    @model_validator(mode="after")
     def _all_joints_are_calibrated(self) -> Self:
         n = len(self.joint_names)
         if self.confidence is not None:
@@ -75,11 +69,6 @@ class PoseOutput(_Frozen):
         if self.spread is not None and len(self.spread.factor) != n:
             raise ValueError(f"spread needs a factor for each of {n} joints")
         return self
-
-    @property
-    def n_maps(self) -> int:
-        """The joints' maps, the background's, and the joints' depths if there are any."""
-        return (2 if self.depths else 1) * len(self.joint_names) + 1
 
     @property
     def side_px(self) -> int:

@@ -34,7 +34,7 @@ class Joints2D:
     68% of errors, or None likewise; ``peak`` (J,), the raw belief at the position, in [0, 1];
     ``depths_px`` (J,), how much farther from the camera than the hip midpoint as the picture shows
     it, in the photo's pixels at the hips' distance, ``(z / z_root - 1) * focal_length_px``, or None
-    where the network has no maps of it.
+    where the network reads none.
     """
 
     positions_px: Floats
@@ -189,15 +189,13 @@ def confidence_features(
 class Reading:
     """What a batch of maps says, in cells: before scaling to a photo and before calibration.
 
-    ``at`` (N, J, 2), ``covariance`` (N, J, 2, 2), ``peak`` (N, J), ``features`` (N, J, F);
-    ``depths`` (N, J) in sides of the crop, or None where there are no maps of them.
+    ``at`` (N, J, 2), ``covariance`` (N, J, 2, 2), ``peak`` (N, J), ``features`` (N, J, F).
     """
 
     at: Floats
     covariance: Floats
     peak: Floats
     features: Floats
-    depths: Floats | None = None
 
 
 def read_maps(
@@ -207,10 +205,8 @@ def read_maps(
     target_sigma_cells: float,
     own: Callable[[Maps, Floats], Maps] | None = None,
 ) -> Reading:
-    """Read a network's (N, C, h, w) maps: the joints', the background's, then depths if any.
+    """Read a network's (N, n_joints + 1, h, w) maps, the last one being the background's.
 
-    A map of depths says for each cell how deep the joint would lie if it were there; of a joint it
-    is read where its marginal is, their mean weighted by that. C is n_joints + 1 without them.
     ``own`` says of marginals and of the beliefs at their strongest cells (N, J) what share of each
     place is the person's own (N, J, h, w); see models/rivals.py.
     """
@@ -230,11 +226,7 @@ def read_maps(
         left = p = without_residue(left)
     covariance = spread(left, at, target_sigma_cells)
     peak = peak_beliefs(joint_maps, best, kind)
-    features = confidence_features(peak, covariance, p, best, background)
-    depths: Floats | None = None
-    if maps.shape[1] > n_joints + 1:
-        depths = np.einsum("njyx,njyx->nj", left, maps[:, n_joints + 1 :]).astype(np.float64)
-    return Reading(at, covariance, peak, features, depths)
+    return Reading(at, covariance, peak, confidence_features(peak, covariance, p, best, background))
 
 
 def calibrated(features: Floats, coefficients: Floats) -> Floats:

@@ -3,7 +3,8 @@
 Networks confuse left and right, and more so on people who bend, lie or fall. The first look tells
 which way up the trunk is; the others see the person upright, in the mirror and smaller, where the
 same mistake is seldom made again. The looks' logits are averaged, in the first one's frame, and so
-are the maps of depths if the network makes any. Who is seen clearly by now is not looked at again.
+are the depths of joints if the network reads any. Who is seen clearly by now is not looked at
+again.
 """
 
 from __future__ import annotations
@@ -38,22 +39,32 @@ class Look:
     share: float
 
 
+@dataclass(frozen=True)
+class Seen:
+    """What a pose network makes of N crops.
+
+    ``maps`` (N, 15, h, w) of the joints, the background's last; ``depths`` (N, 14) of the joints
+    less the hip midpoint's, over the crop's side, or None where the network reads none.
+    """
+
+    maps: Maps
+    depths: Maps | None = None
+
+
 FURTHER = (
     Look(mirrored=True, zoom=1.0, below=0.52, share=0.58),
     Look(mirrored=False, zoom=0.5**0.5, below=0.25, share=0.12),
 )
 """Who is spared a look would gain next to nothing by it (docs/training.md). The third sees the
 corners of a turned crop too."""
-N_BELIEFS = LSP14.n_joints + 1
-"""Maps of joints and background; those after them are the joints' depths."""
-MIRROR = (*LSP14.mirror, LSP14.n_joints, *(N_BELIEFS + joint for joint in LSP14.mirror))
-"""Maps of the mirrored person; without depths the first ``N_BELIEFS``."""
+MIRROR = (*LSP14.mirror, LSP14.n_joints)
+"""Maps of the mirrored person, the background's last."""
 MOST_CHANNELS = 4
 """OpenCV warps that many at once with a constant border."""
 
 
 def leans(maps: Maps) -> Floats:
-    """Angle (N,) rad, clockwise as seen, by which each trunk leans, from (N, C, h, w) maps."""
+    """Angle (N,) rad, clockwise as seen, by which each trunk leans, from (N, 15, h, w) maps."""
     width = maps.shape[-1]
     trunk = maps[:, (R_SHOULDER, L_SHOULDER, R_HIP, L_HIP)]
     best = trunk.reshape(*trunk.shape[:2], -1).argmax(-1)
@@ -91,7 +102,7 @@ def _warped(planes: Maps, matrix: Floats) -> Maps:
 
 
 def belief(maps: Maps) -> NDArray[np.float32]:
-    """How far logits (N, C, h, w) believe in all joints: mean over their strongest cells (N,)."""
+    """How far logits (N, 15, h, w) believe in all joints: mean over their strongest cells (N,)."""
     strongest = maps[:, : LSP14.n_joints].reshape(len(maps), LSP14.n_joints, -1).max(-1)
     mean: NDArray[np.float32] = (1 / (1 + np.exp(-np.clip(strongest, -30, 30)))).mean(1)
     return mean
@@ -102,14 +113,14 @@ def usual(looks: int) -> float:
     return 1 + sum(look.share for look in FURTHER[: looks - 1])
 
 
-def looked_at(run: Callable[[Images], Maps], images: Images, looks: int) -> Maps:
-    """Maps (N, C, h, w) of crops (N, S, S, 3) by the network ``run``, after up to ``looks``.
+def looked_at(see: Callable[[Images], Seen], images: Images, looks: int) -> Seen:
+    """What the network ``see`` makes of crops (N, S, S, 3) in up to ``looks``: logits, depths.
 
-    C is 15, logits, or 29 with maps of depths, which are shares of the crop's side: what is smaller
-    by a look's zoom is so in depth too. Cells that a further look does not see keep what the
-    earlier ones say.
+    Cells that a further look does not see keep what the earlier ones say. What a look shows smaller
+    is shallower in it too.
     """
-    maps = run(images)
+    first = see(images)
+    maps, depths = first.maps, first.depths
     size, cells = images.shape[1], maps.shape[-1]
     for before, look in enumerate(FURTHER[: looks - 1], 1):
         again = np.flatnonzero(belief(maps) < look.below)
@@ -120,17 +131,19 @@ def looked_at(run: Callable[[Images], Maps], images: Images, looks: int) -> Maps
             cv2.warpAffine(image, upright(look, angle, size), (size, size))
             for image, angle in zip(images[again], lean, strict=True)
         ]
-        seen = run(np.asarray(turned, np.uint8))
-        if look.mirrored:
-            seen = seen[:, MIRROR[: seen.shape[1]]]
+        seen = see(np.asarray(turned, np.uint8))
+        seen_maps = seen.maps[:, MIRROR] if look.mirrored else seen.maps
         there = np.stack(
             [
                 _warped(planes, upright(look, angle, cells))
-                for planes, angle in zip(seen, lean, strict=True)
+                for planes, angle in zip(seen_maps, lean, strict=True)
             ]
         )
-        there[:, N_BELIEFS:] /= look.zoom
         mean = (before * maps[again] + there) / (before + 1)
         maps = maps.copy()
         maps[again] = np.where(np.isnan(there), maps[again], mean)
-    return maps
+        if depths is not None and seen.depths is not None:
+            deep = seen.depths[:, LSP14.mirror] if look.mirrored else seen.depths
+            depths = depths.copy()
+            depths[again] = (before * depths[again] + deep / look.zoom) / (before + 1)
+    return Seen(maps, depths)

@@ -13,7 +13,7 @@ from models.card import WEIGHTS_DIR, ModelCard, PoseOutput
 from models.crop import square_crop
 from models.errors import ModelError
 from models.heatmaps import Floats, Joints2D, Maps, calibrated, read_maps
-from models.looks import looked_at
+from models.looks import Seen, looked_at
 from models.person_detector import PersonBox
 from models.providers import ProviderChoice, Runtime
 from models.rivals import shares
@@ -71,19 +71,17 @@ class PoseEstimator:
             crops.append(crop)
             scales.append(scale)
             origins.append(origin)
-        maps = looked_at(self._model.run, np.stack(crops), self._output.looks)
-        return self.read(maps, scales, origins)
+        seen = looked_at(self._model.see, np.stack(crops), self._output.looks)
+        return self.read(seen, scales, origins)
 
     def read(
-        self,
-        maps: NDArray[np.float32],
-        scales: Sequence[float],
-        origins: Sequence[tuple[float, float]],
+        self, seen: Seen, scales: Sequence[float], origins: Sequence[tuple[float, float]]
     ) -> list[Joints2D]:
-        """Joints from the network's maps (N, ``n_maps`` of its card, h, w) of people in one photo.
+        """Joints from what the network made of N people in one photo.
 
         A crop's pixel lies in the photo at origin + scale * pixel.
         """
+        maps = seen.maps
         out = self._output
         scale, origin_px = np.asarray(scales, np.float64), np.asarray(origins, np.float64)
 
@@ -104,8 +102,8 @@ class PoseEstimator:
         if out.spread is not None:
             deviation = np.sqrt(np.trace(covariance_px2, axis1=-2, axis2=-1))
             sigma = deviation * np.asarray(out.spread.factor)
-        if read.depths is not None:
-            depths = read.depths * (scale * out.input_px)[:, None]
+        if seen.depths is not None:
+            depths = seen.depths * (scale * out.input_px)[:, None]
         return [
             Joints2D(
                 positions_px=positions[i],

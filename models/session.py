@@ -25,6 +25,7 @@ from models.card import (
     read_weights,
 )
 from models.errors import ModelError
+from models.looks import Images, Seen
 from models.providers import (
     ProviderChoice,
     Runtime,
@@ -92,38 +93,44 @@ class OnnxModel:
         Of (N, H, W, 3) uint8 BGR its maps (N, C, h, w); of joints (N, 14, 3 or 5), see
         ``models.pose_lifter``, their answer (N, rows, columns).
         """
-        answer: NDArray[np.float32] = self._session.run(None, {self._input: batch})[0]
+        answer: NDArray[np.float32] = self._session.run([self._outputs[0]], {self._input: batch})[0]
         return answer
+
+    def see(self, crops: Images) -> Seen:
+        """What a pose network makes of crops (N, S, S, 3) uint8 BGR."""
+        return Seen(*self._session.run(self._outputs, {self._input: crops}))
 
     def _check(self) -> None:
         """The network takes and gives what its card says, in batches; ``ModelError`` if not."""
         probe = _probe(self.card)
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         kinds = [it.type for it in (*inputs, *outputs)]
-        if len(inputs) != 1 or kinds != [probe.kind, "tensor(float)"]:
+        if len(inputs) != 1 or kinds != [probe.kind, *["tensor(float)"] * len(probe.answers)]:
+            many = "two float outputs" if len(probe.answers) == 2 else "one float output"
             raise self._error(
-                f"another kind of network: expected {probe.wanted} and one float "
-                f"output, found {[f'{i.name} {i.type} {i.shape}' for i in inputs]} and "
+                f"another kind of network: expected {probe.wanted} and {many}, "
+                f"found {[f'{i.name} {i.type} {i.shape}' for i in inputs]} and "
                 f"{[f'{o.name} {o.type}' for o in outputs]}"
             )
-        self._input = inputs[0].name
+        self._input, self._outputs = inputs[0].name, [output.name for output in outputs]
         shape = inputs[0].shape
         if len(shape) != probe.batch.ndim or isinstance(shape[0], int):
             raise self._error(f"fixed to inputs {shape}: the batch size must be free")
         try:
-            answer = self.run(probe.batch)
+            answers = self._session.run(self._outputs, {self._input: probe.batch})
         except Exception as error:
             raise self._error(
                 f"at odds with their card: {probe.given}, as the card has "
                 f"it, are refused ({_said(error)})"
             ) from error
-        if answer.shape != (2, *probe.answer):
-            raise self._error(
-                f"at odds with their card: maps of shape {answer.shape[1:]} instead of "
-                f"{probe.answer} ({probe.meaning})"
-            )
-        if not np.isfinite(answer).all():
-            raise self._error(f"damaged: the {probe.of_nothing} are not finite")
+        for answer, expected in zip(answers, probe.answers, strict=True):
+            if answer.shape != (2, *expected):
+                raise self._error(
+                    f"at odds with their card: maps of shape {answer.shape[1:]} instead of "
+                    f"{expected} ({probe.meaning})"
+                )
+            if not np.isfinite(answer).all():
+                raise self._error(f"damaged: the {probe.of_nothing} are not finite")
 
     def _error(self, what: str) -> ModelError:
         return ModelError(f"model weights {self._path} are {what}; {MEND}")
@@ -131,11 +138,11 @@ class OnnxModel:
 
 @dataclass(frozen=True)
 class _Probe:
-    """Two inputs for a network of some card, the shape of an answer, and words for refusals."""
+    """Two inputs for a network of some card, the shapes of its answers, and words for refusals."""
 
     batch: NDArray[Any]
     kind: str
-    answer: tuple[int, ...]
+    answers: tuple[tuple[int, ...], ...]
     wanted: str
     given: str
     meaning: str
@@ -147,25 +154,25 @@ def _probe(card: ModelCard) -> _Probe:
     if isinstance(output, PoseOutput | DetectorOutput):
         if isinstance(output, PoseOutput):
             height = width = output.input_px
-            channels, meaning = output.n_maps, "joints and background"
-            if output.depths:
-                meaning = "joints, background and the joints' depths"
+            channels = len(output.joint_names) + 1
+            also = ((len(output.joint_names),),) if output.depths else ()
         else:
-            (height, width), channels, meaning = PROBE_PX, 5, "person and box"
+            (height, width), channels, also = PROBE_PX, 5, ()
+        maps = (channels, int(height / output.stride_px), int(width / output.stride_px))
         return _Probe(
             batch=np.zeros((2, height, width, 3), np.uint8),
             kind="tensor(uint8)",
-            answer=(channels, int(height / output.stride_px), int(width / output.stride_px)),
+            answers=(maps, *also),
             wanted="one uint8 image input (N, H, W, 3)",
             given=f"two images of {width}x{height} px",
-            meaning=f"{meaning}, input over stride_px",
+            meaning="joints and background or box, input over stride_px; a depth a joint",
             of_nothing="maps of a black image",
         )
     joints = len(output.joint_names)
     return _Probe(
         batch=made_up_joints(2, output),
         kind="tensor(float)",
-        answer=(1 + 3 * joints, 3 * joints),
+        answers=((1 + 3 * joints, 3 * joints),),
         wanted=f"one float input of joints (N, J, {output.n_columns})",
         given=f"two people of {joints} joints" + (" and depths" if output.reads_depths else ""),
         meaning="a state and the covariance of its errors",

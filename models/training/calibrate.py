@@ -56,7 +56,7 @@ def read_all(model: OnnxModel, output: PoseOutput, samples: list[Sample]) -> Rea
     parts = []
     for start in range(0, len(samples), 32):
         chunk = samples[start : start + 32]
-        maps = looked_at(model.run, np.stack([s.image for s in chunk]), output.looks)
+        maps = looked_at(model.see, np.stack([s.image for s in chunk]), output.looks).maps
         parts.append(
             read_maps(maps, len(output.joint_names), output.maps, output.target_sigma_cells)
         )

@@ -41,6 +41,7 @@ PHOTO_PX = 320
 LABELLED = "Leeds Sports Pose Extended (Johnson & Everingham 2011, research use), human labels"
 PHOTOS = "web photos of everyday and sport poses, labels by BlazePose heavy and a mobile CPM"
 RENDERED = "rendered people: MakeHuman bodies (CC0) in CMU mocap poses"
+DEPTHS = "depths of joints in the photos by BlazePose heavy, where it agrees with their labels"
 SCENES = (
     "whole street and sport scenes, boxes by the BlazePose detector and landmark network, "
     "and by earlier versions of these networks"
@@ -107,7 +108,8 @@ def pose_card(network: ConvolutionalPoseMachine, name: str, version: str, size: 
         file=f"{name}.onnx",
         sha256="",
         description="Convolutional Pose Machine: dense residual backbone, "
-        f"{network.cfg.n_stages} supervised stages at stride 8, last maps at stride 4",
+        f"{network.cfg.n_stages} supervised stages at stride 8, last maps at stride 4"
+        + (", joints' depths" if network.cfg.depths else ""),
         parameters=sum(p.numel() for p in network.parameters()),
         multiply_adds=multiply_adds(network, torch.zeros(1, 3, size, size)),
         output=PoseOutput(
@@ -120,7 +122,7 @@ def pose_card(network: ConvolutionalPoseMachine, name: str, version: str, size: 
             maps="logits",
             depths=network.cfg.depths,
         ),
-        training_data=[LABELLED, PHOTOS, RENDERED],
+        training_data=[LABELLED, PHOTOS, RENDERED, *([DEPTHS] if network.cfg.depths else [])],
         licence="Apache-2.0 (weights); the training images keep their own terms",
         limits=[
             "one person per crop, the one in its centre",

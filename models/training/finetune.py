@@ -88,7 +88,7 @@ def pck(directory: Path, name: str, crops: list[LabelledCrop]) -> float:
     right = total = 0
     for crop in crops:
         sample = canonical(crop, output.input_px)
-        maps = looked_at(model.run, sample.image[None], output.looks)
+        maps = looked_at(model.see, sample.image[None], output.looks).maps
         cells = read_maps(maps, len(output.joint_names), output.maps, output.target_sigma_cells).at[
             0
         ]

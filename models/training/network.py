@@ -3,7 +3,7 @@
 All convolutions are dense (no depthwise ones): on CPUs with bf16 or int8 matrix tiles only those
 profit, and elsewhere they cost little more. Every stage emits 14 joint maps and a background map,
 each stage reads the beliefs of the one before (Wei et al. 2016), every stage is supervised. Beside
-the last stage lie maps of how deep each joint would be, were it in a cell (Mehta et al. 2017).
+the last one it may be read how deep the joints lie.
 """
 
 from __future__ import annotations
@@ -129,30 +129,53 @@ class Stage(nn.Module):
 
 
 class DepthHead(nn.Module):
-    """Features and the last stage's -> a map per joint of its depth, were it there, at stride 8.
+    """What is seen at all joints -> how deep each of them lies.
 
-    Depths are less the hip midpoint's, over the crop's side; to be read where the joint is.
+    Depths are less the hip midpoint's, over the crop's side. Features are read where the last stage
+    believes the joints, and of all of them at once: which leg is the nearer one shows at the hips,
+    and at the knee that hides the other (Mehta et al. 2017 read a map at each joint instead; on the
+    same features that tells half as much).
     """
+
+    WIDTHS = (192, 128)
+    DROPPED = 0.2
 
     def __init__(self, cfg: CpmConfig) -> None:
         super().__init__()
-        s = cfg.stage_width
-        w = s // 2  # half as wide as a stage: a fiftieth of the whole network's work
-        self.enter = _conv_bn(2 * s, w, 1)
-        self.body = Residual(w, w)
-        self.score = nn.Conv2d(w, cfg.n_joints, 1)
+        wide, narrow = self.WIDTHS
+        inputs = cfg.n_joints * (2 * cfg.stage_width + 2)
+        self.norm = nn.BatchNorm1d(inputs, affine=False)
+        self.drop = nn.Dropout(self.DROPPED)
+        self.a = nn.Linear(inputs, wide)
+        self.b = nn.Linear(wide, narrow)
+        self.score = nn.Linear(narrow, cfg.n_joints)
         nn.init.zeros_(self.score.weight)
         nn.init.zeros_(self.score.bias)
 
-    def forward(self, features: Tensor, hidden: Tensor) -> Tensor:
-        """(B, s, h, w) each -> (B, J, h, w)."""
-        out: Tensor = self.score(self.body(F.relu(self.enter(torch.cat([features, hidden], 1)))))
+    def forward(self, features: Tensor, hidden: Tensor, logits: Tensor) -> Tensor:
+        """(B, s, h, w) twice and (B, J + 1, h, w) -> (B, J)."""
+        read = read_at(torch.cat([features, hidden, places(features)], 1), logits[:, :-1])
+        x = F.relu(self.a(self.drop(self.norm(read.flatten(1)))))
+        out: Tensor = self.score(F.relu(self.b(x)))
         return out
+
+
+def places(maps: Tensor) -> Tensor:
+    """Where each cell lies, x and y from -1 to 1, of maps (B, C, h, w): (B, 2, h, w)."""
+    rows, columns = (torch.linspace(-1, 1, n, device=maps.device) for n in maps.shape[2:])
+    grid = torch.stack([columns.expand(len(rows), -1), rows[:, None].expand(-1, len(columns))])
+    return grid.to(maps.dtype).expand(len(maps), -1, -1, -1)
+
+
+def read_at(maps: Tensor, logits: Tensor) -> Tensor:
+    """Means of maps (B, C, h, w) by each joint's marginal, of logits (B, J, h, w): (B, J, C)."""
+    where = torch.softmax(logits.float().flatten(2), -1)
+    return torch.einsum("bjp,bcp->bjc", where, maps.float().flatten(2))
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What the network makes of crops: logits per stage, and depth maps if it has any."""
+    """What the network makes of crops: logits per stage, and depths (B, J) if it reads them."""
 
     stages: list[Tensor]
     depths: Tensor | None
@@ -186,10 +209,12 @@ class ConvolutionalPoseMachine(nn.Module):
         return self.seen(image).stages
 
     def seen(self, image: Tensor, *, only_depths: bool = False) -> Seen:
-        """``forward``, and depth maps (B, 14, H/8, W/8); gradients of these alone if so wanted."""
+        """``forward``, and depths (B, 14); gradients of these alone if so wanted."""
         with torch.set_grad_enabled(torch.is_grad_enabled() and not only_depths):
             stages, features, hidden = self._stages(image)
-        return Seen(stages, None if self.depth is None else self.depth(features, hidden))
+        if self.depth is None:
+            return Seen(stages, None)
+        return Seen(stages, self.depth(features, hidden, stages[-2].detach()))
 
     def _stages(self, image: Tensor) -> tuple[list[Tensor], Tensor, Tensor]:
         x4, features = self.backbone(image)

@@ -98,23 +98,11 @@ def total_loss(
     return torch.stack(terms).mean()
 
 
-def depth_loss(maps: Tensor, logits: Tensor, depths: Tensor, weight: Tensor) -> Tensor:
-    """Mean distance of the depths that are read where the joints are believed from the true ones.
+def depth_loss(found: Tensor, depths: Tensor, weight: Tensor) -> Tensor:
+    """Mean distance of depths (B, J), over the crop's side, from the true ones, nan where unknown.
 
-    Args:
-        maps: (B, J, h, w) depths over the crop's side.
-        logits: (B, J + 1, h, w) of the same stride; they learn nothing by this.
-        depths: (B, J) likewise, nan where unknown.
-        weight: (B, J) trust in the joints' labels.
-
+    ``weight`` (B, J) is the trust in the joints' labels.
     """
-    found = read_depths(maps, logits)
     trust = weight * torch.isfinite(depths)
-    distance = (found - torch.nan_to_num(depths)).abs() * trust
+    distance = (found.float() - torch.nan_to_num(depths)).abs() * trust
     return DEPTH_WEIGHT * distance.sum() / trust.sum().clamp_min(1.0)
-
-
-def read_depths(maps: Tensor, logits: Tensor) -> Tensor:
-    """Depth maps (B, J, h, w) read where logits (B, J + 1, h, w) believe the joints: (B, J)."""
-    where = torch.softmax(logits[:, : maps.shape[1]].detach().float().flatten(2), -1)
-    return (where * maps.float().flatten(2)).sum(-1)

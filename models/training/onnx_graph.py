@@ -8,6 +8,9 @@ joining a normalisation with its convolution) is done once, when a runtime loads
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Mapping
+
 import numpy as np
 import onnx
 from numpy.typing import NDArray
@@ -17,6 +20,7 @@ from torch import nn
 from models.training.network import (
     Backbone,
     ConvolutionalPoseMachine,
+    DepthHead,
     PersonNetwork,
     Residual,
     Stage,
@@ -27,7 +31,10 @@ HALF = ".half"
 PREFIX = "network."
 INPUT, OUTPUT = "image", "maps"
 LAST = "last."
-"""Nodes whose names begin so make the last maps; an 8-bit twin keeps them in single precision."""
+"""Nodes whose names begin so make the last maps, and depths; an 8-bit twin keeps them in single
+precision."""
+DEPTHS = LAST + "depths"
+"""The second output of pose networks that read depths."""
 Axes = tuple[str | int, ...]
 LANES = 16
 """CPU kernels work on blocks of so many channels; other counts fall back to slow ones."""
@@ -197,14 +204,21 @@ class GraphWriter:
         *,
         kind: int = onnx.TensorProto.UINT8,
         names: tuple[str, str] = (INPUT, OUTPUT),
+        also: Mapping[str, Axes] | None = None,
     ) -> onnx.ModelProto:
-        """The finished, checked model; the axes of its input and output have a name or a size."""
+        """The finished, checked model; axes of its input and outputs have a name or a size.
+
+        ``also``: further outputs, by the names of their nodes.
+        """
         self._nodes.append(helper.make_node("Identity", [result], [names[1]], names[1]))
         graph = helper.make_graph(
             self._nodes,
             type(self.network).__name__,
             [helper.make_tensor_value_info(names[0], kind, given)],
-            [helper.make_tensor_value_info(names[1], onnx.TensorProto.FLOAT, found)],
+            [
+                helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, axes)
+                for name, axes in {names[1]: found, **(also or {})}.items()
+            ],
             list(self._initializers.values()),
         )
         model = helper.make_model(
@@ -249,10 +263,44 @@ def _beliefs(w: GraphWriter, hidden: str, score: nn.Conv2d) -> str:
     return w.node("Sigmoid", w.conv(hidden, score, weight=weight, bias=bias))
 
 
+def _depths(
+    w: GraphWriter, features: str, hidden: str, logits: str, net: DepthHead, cells: int
+) -> str:
+    """network.DepthHead, in single precision throughout."""
+    n_joints = net.score.out_features
+    names = (f"{LAST}depths.{number}" for number in itertools.count())
+
+    def node(operator: str, *inputs: str, **attributes: object) -> str:
+        return w.node(operator, *inputs, name=next(names), **attributes)
+
+    flat = w.shape(0, 0, -1)
+    joints = node("Slice", logits, w.shape(0), w.shape(n_joints), w.shape(1))
+    where = node("Softmax", node("Reshape", joints, flat), axis=2)
+    axis = np.linspace(-1, 1, cells, dtype=np.float32)
+    grid = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
+    read = [
+        node("MatMul", where, node("Transpose", node("Reshape", maps, flat), perm=[0, 2, 1]))
+        for maps in (features, hidden)
+    ]
+    read.append(node("MatMul", where, w.constant(grid)))
+    every = node("Reshape", node("Concat", *read, axis=2), w.shape(0, -1))
+    mean, spread = (w.parameter(net.norm, name) for name in ("running_mean", "running_var"))
+    deviation = node("Sqrt", node("Add", spread, w.constant(np.array(net.norm.eps, np.float32))))
+    x = node("Div", node("Sub", every, mean), deviation)
+    for layer in (net.a, net.b):
+        x = node("Relu", _linear(w, x, layer, next(names)))
+    return _linear(w, x, net.score, DEPTHS)
+
+
+def _linear(w: GraphWriter, x: str, module: nn.Linear, name: str) -> str:
+    weight, bias = w.parameter(module, "weight"), w.parameter(module, "bias")
+    return w.node("Gemm", x, weight, bias, transB=1, name=name)
+
+
 def pose_model(network: ConvolutionalPoseMachine, size_px: int) -> onnx.ModelProto:
     """uint8 (n, size, size, 3) BGR -> the last logits (n, 15, size / 4, size / 4).
 
-    Depth maps, if the network has them, come after them, (n, 29, ...).
+    Depths (n, 14) are a second output if the network reads them.
     """
     w = GraphWriter(network)
     x4, features = _backbone(w, INPUT, network.backbone)
@@ -263,20 +311,17 @@ def pose_model(network: ConvolutionalPoseMachine, size_px: int) -> onnx.ModelPro
             beliefs = _beliefs(w, hidden, stage.score)
     fine = w.node("Add", x4, w.up2(w.conv_norm(hidden, network.fine_low)))
     fine = w.residual(w.node("Relu", fine), network.fine)
-    coarse = w.conv(hidden, network.stages[-1].score, name=LAST + "coarse")
-    coarse = w.up2(coarse, "linear", name=LAST + "raised")
+    logits = w.conv(hidden, network.stages[-1].score, name=LAST + "coarse")
+    coarse = w.up2(logits, "linear", name=LAST + "raised")
     fine = w.conv(fine, network.fine_score, name=LAST + "fine")
     result = w.node("Add", fine, coarse, name=LAST + "sum")
-    channels = network.fine_score.out_channels
-    if network.depth is not None:
-        both = w.node("Concat", features, hidden, axis=1)
-        deep = w.residual(w.conv_norm(both, network.depth.enter, relu=True), network.depth.body)
-        deep = w.conv(deep, network.depth.score, name=LAST + "depths")
-        deep = w.up2(deep, name=LAST + "depths_raised")
-        result = w.node("Concat", result, deep, axis=1, name=LAST + "maps")
-        channels += network.cfg.n_joints
     side = size_px // 4
-    return w.model(result, ("n", size_px, size_px, 3), ("n", channels, side, side))
+    found = ("n", network.fine_score.out_channels, side, side)
+    also = {}
+    if network.depth is not None:
+        deep = _depths(w, features, hidden, logits, network.depth, size_px // 8)
+        also = {deep: ("n", network.cfg.n_joints)}
+    return w.model(result, ("n", size_px, size_px, 3), found, also=also)
 
 
 def person_model(network: PersonNetwork) -> onnx.ModelProto:

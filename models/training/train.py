@@ -19,7 +19,7 @@ from models.training import loop
 from models.training.augment import Sample, canonical, random_view
 from models.training.dataset import LabelledCrop, read_crops
 from models.training.network import ConvolutionalPoseMachine, CpmConfig
-from models.training.objective import depth_loss, read_depths, total_loss
+from models.training.objective import depth_loss, total_loss
 from models.training.precision import mixed_precision
 
 
@@ -81,8 +81,9 @@ def measure_depths(
         with torch.no_grad(), mixed_precision(device):
             seen = model.seen(x.to(device))
         assert seen.depths is not None
-        found = read_depths(seen.depths, seen.stages[-2]).cpu()
-        errors.append((found - depths).abs()[(weight > 0) & torch.isfinite(depths)])
+        errors.append(
+            (seen.depths.float().cpu() - depths).abs()[(weight > 0) & torch.isfinite(depths)]
+        )
     return float(torch.cat(errors).mean())
 
 
@@ -99,7 +100,7 @@ def main() -> None:
     parser.add_argument("--blocks", default="2,3,4,3")
     parser.add_argument("--stage-width", type=int, default=64)
     parser.add_argument("--stages", type=int, default=3)
-    parser.add_argument("--depths", type=Path, help="learn depth maps; what depth_teacher wrote")
+    parser.add_argument("--depths", type=Path, help="learn depths too; what depth_teacher wrote")
     parser.add_argument("--only-depths", action="store_true", help="all else stays as it is")
     args = parser.parse_args()
     if args.only_depths and args.depths is None:
@@ -132,7 +133,7 @@ def main() -> None:
             seen = model.seen(x, only_depths=args.only_depths)
         if seen.depths is None:
             return total_loss(seen.stages, joints, weight, presence, x.shape[-1])
-        of_depths = depth_loss(seen.depths, seen.stages[-2], depths, weight)
+        of_depths = depth_loss(seen.depths, depths, weight)
         if args.only_depths:
             return of_depths
         return of_depths + total_loss(seen.stages, joints, weight, presence, x.shape[-1])

@@ -11,7 +11,6 @@ import pytest
 from models.card import (
     WEIGHTS_DIR,
     LiftOutput,
-    PoseOutput,
     read_card,
     read_weights,
     write_card,
@@ -50,15 +49,6 @@ def test_a_full_disk_leaves_the_old_network_and_nothing_else(tmp_path: Path, siz
     assert read_card(tmp_path / "person.json") == card
     assert read_weights(tmp_path / card.file, card) == b"old"
     assert {path.name for path in tmp_path.iterdir()} == {"person.json", card.file}
-
-
-def test_depths_are_read_beside_logits_only() -> None:
-    output = read_card(WEIGHTS_DIR / "cpm.json").output.model_dump()
-    assert not output["depths"]
-    assert PoseOutput.model_validate(output).n_maps == 15
-    assert PoseOutput.model_validate(output | {"depths": True}).n_maps == 29
-    with pytest.raises(ValueError, match="beside logits, not beside beliefs"):
-        PoseOutput.model_validate(output | {"depths": True, "maps": "beliefs", "looks": 1})
 
 
 def test_depths_are_of_joints_that_were_found() -> None:

@@ -81,53 +81,6 @@ def test_a_hill_is_believed_before_a_sharper_peak_of_less_belief() -> None:
     np.testing.assert_allclose(read.at[0, 0], (10, 20), atol=0.1)
 
 
-def with_depths(logits: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Maps (1, 2J + 1, CELLS, CELLS) of J joints, a background, and depths."""
-    maps: np.ndarray = np.concatenate([logits, np.zeros((1, CELLS, CELLS)), depths])
-    return maps[None].astype(np.float32)
-
-
-def test_the_depth_of_a_joint_is_the_map_s_where_the_joint_is() -> None:
-    rng = np.random.default_rng(4)
-    depths = rng.normal(size=(3, CELLS, CELLS))
-    at = np.array([(3, 5), (20, 20), (39, 0)])
-    logits = np.full((3, CELLS, CELLS), -200.0)
-    logits[np.arange(3), at[:, 1], at[:, 0]] = 200.0
-    read = read_maps(with_depths(logits, depths), 3, "logits", 1.0)
-    assert read.depths is not None
-    np.testing.assert_allclose(read.depths[0], depths[np.arange(3), at[:, 1], at[:, 0]], rtol=1e-6)
-
-
-def test_the_depth_of_a_joint_is_its_marginal_s_mean() -> None:
-    slope = np.mgrid[:CELLS, :CELLS][1] / 100.0
-    logits = gaussian(12.3, 22.6, 1.5, 2.0)[None]
-    both = np.logaddexp(logits, np.log(0.5) + gaussian(30.0, 22.6, 1.5, 2.0)[None])
-    for maps, mean in ((logits, 0.123), (both, (2 * 0.123 + 0.3) / 3)):
-        read = read_maps(with_depths(maps, slope[None]), 1, "logits", 1.0)
-        assert read.depths is not None
-        np.testing.assert_allclose(read.depths, mean, atol=1e-5)
-
-    def own(p: np.ndarray, _: np.ndarray) -> np.ndarray:
-        share = np.ones_like(p)
-        share[..., 20:] = 0.0
-        return share
-
-    # What is somebody else's does not count, and what is left counts in full.
-    read = read_maps(with_depths(both, slope[None]), 1, "logits", 1.0, own)
-    assert read.depths is not None
-    np.testing.assert_allclose(read.depths, 0.123, atol=1e-5)
-
-
-def test_without_maps_of_depths_there_are_none_and_nothing_else_changes() -> None:
-    rng = np.random.default_rng(5)
-    maps = rng.normal(0, 3, (2, 29, CELLS, CELLS)).astype(np.float32)
-    told, untold = (read_maps(m, 14, "logits", 1.0) for m in (maps, maps[:, :15].copy()))
-    assert untold.depths is None
-    assert told.depths is not None
-    for name in ("at", "covariance", "peak", "features"):
-        np.testing.assert_array_equal(getattr(told, name), getattr(untold, name))
-
-
 def test_beliefs_and_logits_give_the_same_place() -> None:
     log_map = gaussian(17.3, 22.6, 1.5, 2.0)
     logits, _ = sub_cell_peaks(marginals(log_map[None, None].astype(np.float32), "logits"))

@@ -8,7 +8,7 @@ from library_store.skeleton import L_HIP, L_SHOULDER, LSP14, R_HIP, R_SHOULDER
 from models.card import WEIGHTS_DIR, read_card
 from models.errors import ModelError
 from models.heatmaps import sub_cell_peaks
-from models.looks import FURTHER, Look, belief, leans, looked_at, upright
+from models.looks import FURTHER, Look, Seen, belief, leans, looked_at, upright
 
 CELLS, SIZE = 40, 160
 STRIDE = SIZE // CELLS
@@ -62,76 +62,32 @@ def test_looks_that_agree_change_nothing(angle_deg: float, looks: int) -> None:
     joints = leaning(angle_deg)
     views: list[NDArray[np.uint8]] = []
 
-    def run(images: NDArray[np.uint8]) -> NDArray[np.float32]:
+    depths = np.random.default_rng(1).uniform(-0.3, 0.3, (1, 14)).astype(np.float32)
+
+    def see(images: NDArray[np.uint8]) -> Seen:
         views.append(images)
         if len(views) == 1:
-            return gaussians(joints)
+            return Seen(gaussians(joints), depths)
         look = FURTHER[len(views) - 2]
         matrix = upright(look, leans(gaussians(joints))[0], CELLS)
         seen = joints @ matrix[:, :2].T + matrix[:, 2]
-        return gaussians(seen[list(LSP14.mirror)] if look.mirrored else seen)
+        names = list(LSP14.mirror) if look.mirrored else list(range(14))
+        return Seen(gaussians(seen[names]), depths[:, names] * np.float32(look.zoom))
 
     image = np.random.default_rng(0).integers(0, 255, (1, SIZE, SIZE, 3)).astype(np.uint8)
-    mean = looked_at(run, image, looks)
+    mean = looked_at(see, image, looks)
     assert len(views) == looks
-    found, _ = sub_cell_peaks(np.exp(mean[:, :14]))
+    found, _ = sub_cell_peaks(np.exp(mean.maps[:, :14]))
     np.testing.assert_allclose(found[0], joints, atol=0.15)
-
-
-def depth_maps(joints_depth: NDArray[np.float64], at: NDArray[np.float64]) -> NDArray[np.float32]:
-    """(1, 14, CELLS, CELLS) of depths at places (CELLS, CELLS, 2): the deeper the further down."""
-    slope = 0.002 * (at - CELLS / 2) @ np.array([0.5, 1.0])
-    maps: NDArray[np.float32] = (joints_depth[:, None, None] + slope)[None].astype(np.float32)
-    return maps
-
-
-@pytest.mark.parametrize("looks", [2, 3])
-@pytest.mark.parametrize("angle_deg", [0, 30, -75, 140, 180])
-def test_every_look_says_the_same_of_depths(angle_deg: float, looks: int) -> None:
-    """What is small in a look is shallow in it; the mirror exchanges names, not depths."""
-    joints = leaning(angle_deg)
-    depths = np.random.default_rng(2).uniform(-0.3, 0.3, 14)
-    cells = np.stack(np.meshgrid(np.arange(CELLS), np.arange(CELLS)), -1).astype(np.float64)
-    first = np.concatenate([gaussians(joints), depth_maps(depths, cells)], 1)
-    views: list[NDArray[np.uint8]] = []
-
-    def run(images: NDArray[np.uint8]) -> NDArray[np.float32]:
-        views.append(images)
-        if len(views) == 1:
-            return first
-        look = FURTHER[len(views) - 2]
-        matrix = upright(look, leans(first)[0], CELLS)
-        seen = joints @ matrix[:, :2].T + matrix[:, 2]
-        from_there = (cells - matrix[:, 2]) @ np.linalg.inv(matrix[:, :2]).T
-        names = list(LSP14.mirror) if look.mirrored else slice(None)
-        deep = look.zoom * depth_maps(depths[names], from_there)
-        return np.concatenate([gaussians(seen[names]), deep], 1)
-
-    image = np.random.default_rng(0).integers(0, 255, (1, SIZE, SIZE, 3)).astype(np.uint8)
-    mean = looked_at(run, image, looks)
-    assert len(views) == looks
-    np.testing.assert_allclose(mean[:, 15:], first[:, 15:], atol=0.005)
-
-
-def test_maps_of_depths_leave_the_others_as_they_are() -> None:
-    rng = np.random.default_rng(3)
-    seen = [
-        np.concatenate([gaussians(leaning(20)), rng.normal(size=(1, 14, CELLS, CELLS))], 1).astype(
-            np.float32
-        )
-        for _ in range(3)
-    ]
-    image = np.zeros((1, SIZE, SIZE, 3), np.uint8)
-    with_depths, without = iter(seen), iter([maps[:, :15] for maps in seen])
-    both = looked_at(lambda _: next(with_depths), image, 3)
-    np.testing.assert_array_equal(both[:, :15], looked_at(lambda _: next(without), image, 3))
-    assert next(with_depths, None) is None
+    assert mean.depths is not None
+    np.testing.assert_allclose(mean.depths, depths, rtol=1e-5)
 
 
 def test_one_look_is_the_network_itself() -> None:
     maps = gaussians(leaning(20))
-    seen = looked_at(lambda _: maps, np.zeros((1, SIZE, SIZE, 3), np.uint8), 1)
-    assert seen is maps
+    seen = looked_at(lambda _: Seen(maps), np.zeros((1, SIZE, SIZE, 3), np.uint8), 1)
+    assert seen.maps is maps
+    assert seen.depths is None
 
 
 def test_what_only_the_first_look_sees_stays_its_own() -> None:
@@ -139,7 +95,7 @@ def test_what_only_the_first_look_sees_stays_its_own() -> None:
     first = gaussians(leaning(45))
 
     calls = iter([first, np.full_like(first, 7.0)])
-    both = looked_at(lambda _: next(calls), np.zeros((1, SIZE, SIZE, 3), np.uint8), 2)
+    both = looked_at(lambda _: Seen(next(calls)), np.zeros((1, SIZE, SIZE, 3), np.uint8), 2).maps
     np.testing.assert_array_equal(both[..., 0, 0], first[..., 0, 0])
     middle = CELLS // 2
     np.testing.assert_allclose(
@@ -151,12 +107,12 @@ def test_who_is_seen_clearly_is_not_looked_at_again() -> None:
     clear, doubtful = gaussians(leaning(20), top=2.0), gaussians(leaning(20))
     seen: list[int] = []
 
-    def run(images: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def see(images: NDArray[np.uint8]) -> Seen:
         seen.append(len(images))
         first = np.concatenate([clear, doubtful, clear])
-        return first if len(seen) == 1 else np.full_like(doubtful, 7.0)
+        return Seen(first if len(seen) == 1 else np.full_like(doubtful, 7.0))
 
-    both = looked_at(run, np.zeros((3, SIZE, SIZE, 3), np.uint8), 2)
+    both = looked_at(see, np.zeros((3, SIZE, SIZE, 3), np.uint8), 2).maps
     assert seen == [3, 1]
     np.testing.assert_array_equal(both[[0, 2]], np.concatenate([clear, clear]))
     assert not np.array_equal(both[1], doubtful[0])
@@ -168,18 +124,23 @@ def test_every_look_counts_the_same_and_is_taken_at_the_doubtful_only() -> None:
     first = np.concatenate([gaussians(leaning(0), top) for top in heights.values()])
     asked: list[int] = []
 
-    def run(images: NDArray[np.uint8]) -> NDArray[np.float32]:
+    def see(images: NDArray[np.uint8]) -> Seen:
         asked.append(len(images))
+        depths = np.full((len(images), 14), len(asked), np.float32)
         if len(asked) == 1:
-            return first
-        return np.full_like(first[: len(images)], 0.0 if len(asked) == 2 else -9.0)
+            return Seen(first, depths)
+        maps = np.full_like(first[: len(images)], 0.0 if len(asked) == 2 else -9.0)
+        return Seen(maps, depths * np.float32(FURTHER[len(asked) - 2].zoom))
 
-    seen = looked_at(run, np.zeros((3, SIZE, SIZE, 3), np.uint8), 3)
+    both = looked_at(see, np.zeros((3, SIZE, SIZE, 3), np.uint8), 3)
+    seen = both.maps
     assert asked == [3, 2, 1]
     middle = (..., CELLS // 2, CELLS // 2)
     np.testing.assert_allclose(seen[0][middle], (first[0][middle] + 0 - 9) / 3, atol=1e-5)
     np.testing.assert_allclose(seen[1][middle], first[1][middle] / 2, atol=1e-5)
     np.testing.assert_array_equal(seen[2], first[2])
+    assert both.depths is not None
+    np.testing.assert_allclose(both.depths, [[2.0] * 14, [1.5] * 14, [1.0] * 14])
 
 
 def test_the_third_view_cuts_no_corner_off() -> None:

@@ -19,13 +19,16 @@ BRIGHT = np.array([150.0, 200.0, 250.0])
 def estimator(tmp_path: Path, request: pytest.FixtureRequest) -> PoseEstimator:
     """Takes the brightest blue for the 1st, 4th, ... joint, and its brightness for the depth."""
     deep: bool = request.param
-    maps = (["planes"] * 9 + ["most"] * 2) if deep else ["planes"] * 5
+    depths = [
+        node("ReduceMax", ["planes"], "bright", axes=[2, 3], keepdims=0),
+        node("ReduceMax", ["bright"], "most", axes=[1]),
+        node("Concat", ["bright"] * 4 + ["most"] * 2, "depths", axis=1),
+    ]
     data = tiny_onnx.model(
         planes(
-            node("ReduceMax", ["planes"], "most", axes=[1]),
-            node("Concat", maps, "all", axis=1),
-            last="all",
-        )
+            node("Concat", ["planes"] * 5, "all", axis=1), *(depths if deep else ()), last="all"
+        ),
+        also="depths" if deep else None,
     )
     output: Any = tiny_onnx.card("tiny", data)["output"]
     output |= {"joint_names": LSP14.joint_names, "depths": deep}

@@ -78,12 +78,18 @@ def model(
     kind: int = UINT8,
     made: int = FLOAT,
     answer: Axes = ("a", "b", "c", "d"),
+    also: str | None = None,
     opset: int = 17,
 ) -> bytes:
-    """A ModelProto from ``image`` to ``maps``, float unless something else is ``made``."""
+    """A ModelProto from ``image`` to ``maps``, float unless something else is ``made``.
+
+    ``also`` names a second output, (N, any) floats.
+    """
     graph = b"".join(_field(1, n) for n in nodes) + _field(2, "tiny")
     graph += _field(11, _value("image", kind, image))
     graph += _field(12, _value("maps", made, answer))
+    if also is not None:
+        graph += _field(12, _value(also, FLOAT, ("a", "e")))
     return _field(1, 8) + _field(7, graph) + _field(8, _field(2, opset))
 
 

@@ -67,7 +67,7 @@ def test_pose_graph_equals_its_module(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
 
-def test_depth_maps_come_after_the_logits_which_stay_as_they_were(tmp_path: Path) -> None:
+def test_depths_are_a_second_output_and_the_logits_stay_as_they_were(tmp_path: Path) -> None:
     plain = shaken(ConvolutionalPoseMachine(CPM))
     network = shaken(ConvolutionalPoseMachine(replace(CPM, depths=True)))
     network.load_state_dict(plain.state_dict(), strict=False)
@@ -75,17 +75,19 @@ def test_depth_maps_come_after_the_logits_which_stay_as_they_were(tmp_path: Path
     assert isinstance(card.output, PoseOutput)
     assert card.output.depths
     assert config_of(read_weights(tmp_path / card.file)) == network.cfg
-    images = np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3)).astype(np.uint8)
-    found, expected = outputs(tmp_path / card.file, plain, images)
-    assert found.shape == (2, 29, 16, 16)
-    scale = np.abs(expected).max()
-    np.testing.assert_allclose(found[:, :15], expected, rtol=1e-4, atol=1e-4 * scale)
+    images = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3)).astype(np.uint8)
+    _, expected = outputs(tmp_path / card.file, plain, images)
     with torch.no_grad():
-        seen = network.seen(torch.from_numpy(images).permute(0, 3, 1, 2).float() / 127.5 - 1)
+        deep = network.seen(torch.from_numpy(images).permute(0, 3, 1, 2).float() / 127.5 - 1).depths
+    seen = OnnxModel(tmp_path, card.name).see(images)
     assert seen.depths is not None
-    maps = seen.depths.numpy()
-    raised = maps.repeat(2, axis=2).repeat(2, axis=3)
-    np.testing.assert_allclose(found[:, 15:], raised, rtol=1e-4, atol=1e-4 * np.abs(maps).max())
+    assert deep is not None
+    expected_deep = deep.numpy()
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(seen.maps, expected, rtol=1e-4, atol=1e-4 * scale)
+    np.testing.assert_allclose(
+        seen.depths, expected_deep, rtol=1e-3, atol=1e-4 * np.abs(expected_deep).max()
+    )
 
 
 @pytest.mark.parametrize("shape", [(1, 64, 96, 3), (2, 96, 32, 3)])
