@@ -38,10 +38,12 @@ class TeacherPerson:
 class TeacherPose:
     """One person, and how sure the teacher is that somebody is there.
 
-    ``landmarks_px`` (33, 2) in the image's pixels, ``depths_px`` (33,) less the hips', likewise.
+    ``landmarks_px`` (33, 2) in the image's pixels, ``depths_px`` (33,) less the hips', likewise;
+    ``landmarks_mm`` (33, 3) about the hips, on axes of the crop turned upright.
     """
 
     landmarks_px: NDArray[np.float64]
+    landmarks_mm: NDArray[np.float64]
     depths_px: NDArray[np.float64]
     score: float
 
@@ -136,7 +138,12 @@ class BlazePose:
         here, there = (part[body, :2] - part[body, :2].mean(0) for part in (world, at))
         px_per_metre = (here * there).sum() / max(float((here * here).sum()), 1e-9)
         back: NDArray[np.float64] = (at - shift) @ np.linalg.inv(linear).T
-        return TeacherPose(back, world[:, 2] * px_per_metre / scale, float(presence.reshape(-1)[0]))
+        return TeacherPose(
+            landmarks_px=back,
+            landmarks_mm=1000 * world,
+            depths_px=world[:, 2] * px_per_metre / scale,
+            score=float(presence.reshape(-1)[0]),
+        )
 
     def people(
         self, image: Image, threshold: float = 0.5, tiles: bool = True

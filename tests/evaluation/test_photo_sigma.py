@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,8 +18,7 @@ from evaluation.networks import OFF
 from evaluation.photo_sigma import Answers, Seen, fit_doubts
 from library_store.build import BuildSettings, build_library
 from library_store.prior import PosePrior
-
-RENDERS = Path(__file__).parents[1] / "data" / "renders"
+from tests.evaluation.rendered_set import write_set
 
 
 def made_up(people: int) -> tuple[Answers, SigmaCalibration]:
@@ -75,31 +72,16 @@ def test_what_is_checked_is_what_is_served(tmp_path: Path) -> None:
 def test_the_command_measures_photos_with_truth(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    truth = json.loads((RENDERS / "ground_truth.json").read_text())
-    records = [
-        {
-            "image": render["file"],
-            "joints_px": render["joints_2d_px"],
-            "joints_mm": render["joints_3d_mm"],
-            "focal_length_px": render["K"][0][0],
-            "principal_point_px": [render["K"][0][2], render["K"][1][2]],
-        }
-        for render in truth["images"]
-    ]
     photos = tmp_path / "photos"
-    photos.mkdir()
-    for record in records:
-        shutil.copy(RENDERS / record["image"], photos)
-    (photos / "annotations.json").write_text(json.dumps({"images": 3 * records}))
+    people = write_set(photos, times=3)
     library = tmp_path / "tiny"
     build_library(library, PosePrior.load(), BuildSettings(name="tiny", n_poses=2_000, seed=3))
     command = ["--renders", str(photos), "--library", str(library), "--network", "off"]
     photo_sigma.main(command)
     printed = capsys.readouterr().out
-    assert f"{3 * len(records)} people, {3 * len(records)} lifted" in printed
+    assert f"{people} people, {people} lifted" in printed
     assert printed.count("\n| ") == 4
 
-    del records[0]["joints_mm"]
-    (photos / "annotations.json").write_text(json.dumps({"images": 3 * records}))
+    write_set(photos, with_3d=False)
     with pytest.raises(SystemExit, match="no 3D truth"):
         photo_sigma.main(command)
