@@ -1,17 +1,20 @@
 """From a network's maps to joints in the photo, on a network small enough to know its answers."""
 
+import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from library_store.skeleton import LSP14
+from library_store.skeleton import L_HIP, LSP14, R_HIP
 from models import PersonBox, PoseEstimator
 from tests.models import tiny_onnx
 from tests.models.tiny_onnx import node, planes
 
+RENDERS = Path(__file__).parents[1] / "data" / "renders"
 BRIGHT = np.array([150.0, 200.0, 250.0])
 
 
@@ -69,3 +72,29 @@ def test_people_are_told_apart(estimator: PoseEstimator) -> None:
         assert (person.depths_px is None) == (alone.depths_px is None)
         if person.depths_px is not None and alone.depths_px is not None:
             np.testing.assert_allclose(person.depths_px, alone.depths_px, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["cpm", "cpm-int8"])
+def test_the_shipped_networks_see_which_limb_is_nearer(name: str) -> None:
+    """Of people with exact truth, and as well of their mirror images."""
+    estimator = PoseEstimator(name)
+    read, true = [], []
+    for render in json.loads((RENDERS / "ground_truth.json").read_text())["images"]:
+        image = np.asarray(cv2.imread(str(RENDERS / render["file"])), np.uint8)
+        joints_px, joints_mm = np.array(render["joints_2d_px"]), np.array(render["joints_3d_mm"])
+        hips_mm = joints_mm[[R_HIP, L_HIP], 2].mean()
+        depths_px = (joints_mm[:, 2] / hips_mm - 1) * render["K"][0][0]
+        (x, y), (width, height) = joints_px.min(0), np.ptp(joints_px, axis=0)
+        right = image.shape[1] - 1 - (x + width)
+        mirrored = np.ascontiguousarray(image[:, ::-1])
+        for photo, left, names in (
+            (image, x, list(range(14))),
+            (mirrored, right, list(LSP14.mirror)),
+        ):
+            (found,) = estimator.estimate(photo, [PersonBox(left, y, width, height, 1.0)])
+            assert found.depths_px is not None
+            read.append(found.depths_px[names] / height)
+            true.append(depths_px / height)
+    assert np.corrcoef(np.ravel(read), np.ravel(true))[0, 1] > 0.6
+    apart = np.abs(np.subtract(read[0::2], read[1::2])).mean()
+    assert apart < 0.5 * np.abs(true).mean()
