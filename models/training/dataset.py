@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import cv2
 import numpy as np
@@ -252,10 +253,13 @@ def held_out(crop: LabelledCrop) -> bool:
 def with_depths(crops: list[LabelledCrop], path: Path) -> list[LabelledCrop]:
     """The crops with the depths that ``depth_teacher`` wrote for their set.
 
-    Raises ``AnnotationError`` for another set's.
+    Raises ``AnnotationError`` for another set's and for any other file.
     """
-    with np.load(path, allow_pickle=False) as stored:
-        depths = dict(zip(stored["image"].tolist(), stored["depths_px"], strict=True))
+    try:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as stored:
+            depths = dict(zip(stored["image"].tolist(), stored["depths_px"], strict=True))
+    except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
+        raise AnnotationError(f"{path} is not what depth_teacher wrote: {error}") from error
     if not depths.keys() >= {crop.name for crop in crops}:
         raise AnnotationError(f"{path} has the depths of another set")
     return [replace(crop, depths_px=depths[crop.name]) for crop in crops]

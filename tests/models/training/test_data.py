@@ -241,6 +241,9 @@ def test_another_set_s_depths_are_refused(tmp_path: Path) -> None:
     np.savez(folder / "lspet_x.npz", image=names[1:], depths_px=np.ones((len(names) - 1, 14)))
     with pytest.raises(AnnotationError, match="depths of another set"):
         read_crops(tmp_path, "lspet_x", "", folder)
+    (folder / "lspet_x.npz").write_bytes(b"no archive")
+    with pytest.raises(AnnotationError, match="not what depth_teacher wrote"):
+        read_crops(tmp_path, "lspet_x", "", folder)
 
 
 def test_the_canonical_view_holds_every_joint() -> None:
