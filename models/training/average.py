@@ -19,7 +19,7 @@ def average(checkpoints: list[dict[str, Any]]) -> dict[str, Any]:
     """The last checkpoint with the mean of all averaged weights. One architecture only."""
     *others, last = checkpoints
     for other in others:
-        if other["config"] != last["config"]:
+        if _architecture(other) != _architecture(last):
             raise ValueError(f"of another architecture: {other['config']}, not {last['config']}")
     mean = {
         key: torch.stack([c["ema"][key] for c in checkpoints]).mean(0)
@@ -28,6 +28,11 @@ def average(checkpoints: list[dict[str, Any]]) -> dict[str, Any]:
         for key, value in last["ema"].items()
     }
     return {**{k: last[k] for k in ("config", "step", "size_px")}, "ema": mean}
+
+
+def _architecture(checkpoint: dict[str, Any]) -> dict[str, Any]:
+    """Its configuration; runs from before any network read depths say nothing of them."""
+    return {"depths": False, **checkpoint["config"]}
 
 
 def main() -> None:

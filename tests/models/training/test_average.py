@@ -22,3 +22,16 @@ def test_the_mean_of_the_weights_and_the_rest_of_the_last_run() -> None:
 def test_other_architectures_are_refused() -> None:
     with pytest.raises(ValueError, match="another architecture"):
         average([checkpoint(1.0), checkpoint(1.0, width=8)])
+
+
+def test_runs_from_before_networks_read_depths_go_with_those_that_read_none() -> None:
+    later = checkpoint(4.0)
+    for depths, fits in ((False, True), (True, False)):
+        later["config"] = {"width": 4, "depths": depths}
+        if fits:
+            assert torch.equal(
+                average([checkpoint(1.0), later])["ema"]["weight"], torch.full((2, 4), 2.5)
+            )
+            continue
+        with pytest.raises(ValueError, match="another architecture"):
+            average([checkpoint(1.0), later])
