@@ -231,9 +231,13 @@ def test_a_batch_gives_what_its_images_give_alone(name: str) -> None:
     model = OnnxModel(WEIGHTS_DIR, name)
     size = model.card.output.model_dump()["input_px"]
     images = np.random.default_rng(0).integers(0, 256, (3, size, size, 3)).astype(np.uint8)
-    together = model.run(images)
+    together = model.see(images)
+    assert together.depths is not None
     for i in range(3):
-        np.testing.assert_allclose(model.run(images[i : i + 1])[0], together[i], atol=1e-3)
+        alone = model.see(images[i : i + 1])
+        assert alone.depths is not None
+        np.testing.assert_allclose(alone.maps[0], together.maps[i], atol=1e-3)
+        np.testing.assert_allclose(alone.depths[0], together.depths[i], atol=1e-5)
 
 
 def test_a_provider_that_is_not_installed_is_refused() -> None:
