@@ -1,12 +1,12 @@
 """The whole pipeline on rendered people with exact truth: photo in, 2D and 3D errors out.
 
-    python -m evaluation.renders --data DIR [--own-boxes]
+    python -m evaluation.renders --data DIR [--own-boxes] [--figure PATH]
 
 ``--data`` has the JPEGs and a ``ground_truth.json`` as in ``tests/data/renders``. The service's own
 settings (POSEMATCH_*) choose model and library. The true focal length is given.
 
 The second table lifts the same people from better and worse 2D: it tells what of the error is the
-network's and what is the lifting's.
+network's and what is the lifting's. ``--figure`` draws the worst of them.
 """
 
 from __future__ import annotations
@@ -14,17 +14,23 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
+from app.drawing import NOVEL_VIEWS, draw_novel_view, draw_overlay
+from app.drawing.picture import Pixels, Words
+from app.drawing.raster import to_pixels
 from app.engine import load_engine
+from app.imaging import decode_photo
 from app.lifting.types import LiftedPerson
-from app.pipeline import LiftQuery, PhotoQuery, Pipeline, SeenPerson
+from app.pipeline import LiftQuery, PhotoQuery, PhotoResult, Pipeline, SeenPerson
 from app.settings import load_settings
 from evaluation.metrics import (
     Floats,
+    root,
     root_centred_error_mm,
     similarity_error_mm,
 )
@@ -35,6 +41,7 @@ LIMBS = list(LIMB_JOINTS)
 NOISE_TORSOS = (0.025, 0.05, 0.1, 0.2)
 """Standard deviation a coordinate, torso lengths."""
 NOISE_DRAWS = 5
+WORST, FIGURE_PX, PAPER, MOST_PIXELS = 3, 380, 255, 100_000_000
 
 
 @dataclass(frozen=True)
@@ -162,11 +169,31 @@ def by_2d(pipeline: Pipeline, renders: list[Render], found: list[Floats | None])
     return "\n".join(lines)
 
 
+def drawn(photo: Path, result: PhotoResult, render: Render, title: str) -> Pixels:
+    """The joints found in a photo, and the answer from two sides, before the truth in grey."""
+    data = photo.read_bytes()
+    decoded = decode_photo(data, max_pixels=MOST_PIXELS, side_px=max(render.size_px))
+    (person,) = result.people
+    assert isinstance(person.lifted, LiftedPerson)
+    # Where it is depends on how large somebody is taken to be: hips onto hips.
+    truth_mm = render.joints_mm + root(person.lifted.joints_3d_mm) - root(render.joints_mm)
+    ghost = replace(person.lifted.exemplar, joints_mm=truth_mm)
+    beside_truth = replace(person, lifted=replace(person.lifted, exemplar=ghost))
+    picture = draw_overlay(decoded, [person], height_px=FIGURE_PX)
+    words = Words(title, np.array([14.0, 26.0]), (255, 255, 255))
+    picture = replace(picture, marks=(*picture.marks, words))
+    shown = replace(result, people=(beside_truth,))
+    for view in NOVEL_VIEWS:
+        picture = picture.beside(draw_novel_view(shown, view, side_px=FIGURE_PX))
+    return to_pixels(picture)
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--own-boxes", action="store_true", help="detect, instead of the true box")
+    parser.add_argument("--figure", type=Path, help="picture to write of the worst answers")
     args = parser.parse_args()
     renders = read_renders(args.data)
     pipeline = load_engine(load_settings()).pipeline
@@ -176,6 +203,7 @@ def main() -> None:
     near, similar, centred = [], [], []
     tilts_deg, turns_deg, reprojections_px, within = [], [], [], []
     found: list[Floats | None] = []
+    drawable: list[tuple[float, Render, PhotoResult]] = []
     for render in renders:
         truth_px, truth_mm = render.joints_px, render.joints_mm
         low = truth_px.min(0)
@@ -192,6 +220,7 @@ def main() -> None:
         answer = person.lifted.joints_3d_mm
         near.append(correct_keypoints(person.joints_px, truth_px)[LIMBS])
         similar.append(float(similarity_error_mm(answer[LIMBS], truth_mm[LIMBS]).mean()))
+        drawable.append((similar[-1], render, replace(result, people=(person,))))
         errors_mm = root_centred_error_mm(answer, truth_mm)
         centred.append(float(errors_mm.mean()))
         sigma_mm = person.lifted.sigma_mm
@@ -219,6 +248,19 @@ def main() -> None:
         f"{np.concatenate(within).mean():.0%} of the root-relative errors.\n"
     )
     print(by_2d(pipeline, renders, found))
+    if args.figure is not None:
+        worst = sorted(drawable, key=lambda shown: -shown[0])[:WORST]
+        rows = [
+            drawn(args.data / render.file, result, render, f"{render.file}: PA {error_mm:.0f} mm")
+            for error_mm, render, result in worst
+        ]
+        width = max(pixels.shape[1] for pixels in rows)
+        padded = [
+            np.pad(pixels, ((0, 0), (0, width - pixels.shape[1]), (0, 0)), constant_values=PAPER)
+            for pixels in rows
+        ]
+        if not cv2.imwrite(str(args.figure), np.concatenate(padded)):
+            raise SystemExit(f"{args.figure} cannot be written")
 
 
 if __name__ == "__main__":

@@ -61,3 +61,22 @@ def test_pictures_with_nobody_on_them_are_named(
     with pytest.raises(SystemExit, match="nobody of 1 pictures"):
         program.main()
     assert "| 0 | not found |" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("settings")
+def test_the_worst_answers_are_drawn_before_the_truth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    figure = tmp_path / "worst.png"
+    monkeypatch.setattr("sys.argv", ["renders", "--data", str(RENDERS), "--figure", str(figure)])
+    program.main()
+    errors = [
+        float(line.split("|")[4])
+        for line in capsys.readouterr().out.splitlines()
+        if line.startswith("| 0")
+    ]
+    assert len(errors) > program.WORST
+    picture = cv2.imread(str(figure))
+    assert picture is not None
+    assert picture.shape[0] == program.WORST * program.FIGURE_PX
+    assert picture.shape[1] > 3 * program.FIGURE_PX
