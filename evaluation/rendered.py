@@ -24,11 +24,10 @@ from app.settings import load_settings
 from evaluation.metrics import Floats, similarity_error_mm
 from evaluation.photo_sigma import Seen, find_joints
 from evaluation.progress import followed
-from library_store.skeleton import L_HIP, L_SHOULDER, LIMB_JOINTS, R_HIP, R_SHOULDER
+from library_store.skeleton import LIMB_JOINTS
 from models.pck import correct_keypoints
 from models.training.dataset import MP33_LIMBS, Image, decode_members, read_annotations
-from models.training.depth_teacher import ROOM
-from models.training.teachers import BlazePose
+from models.training.teachers import BlazePose, circle
 
 LIMBS = list(LIMB_JOINTS)
 
@@ -50,11 +49,10 @@ def pa_mm(found: Floats, truth: Floats) -> float:
 
 def blazepose(network: BlazePose, image: Image, joints_px: Floats) -> tuple[Floats, Floats]:
     """Its limb joints (12, 2) px and (12, 3) mm, about a person who is where the truth says."""
-    hips = 0.5 * (joints_px[R_HIP] + joints_px[L_HIP])
-    up = 0.5 * (joints_px[R_SHOULDER] + joints_px[L_SHOULDER]) - hips
-    up /= max(float(np.linalg.norm(up)), 1e-9)
-    reach = ROOM * np.linalg.norm(joints_px - hips, axis=1).max()
-    seen = network.person(image, hips, hips + reach * up)
+    about = circle(joints_px, np.ones(len(joints_px), bool))
+    if about is None:  # the trunk points at the camera: which way up is as good as any
+        about = joints_px.mean(0), joints_px.mean(0) - np.array([0.0, np.ptp(joints_px)])
+    seen = network.person(image, *about)
     return seen.landmarks_px[list(MP33_LIMBS)], seen.landmarks_mm[list(MP33_LIMBS)]
 
 

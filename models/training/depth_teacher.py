@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from library_store.skeleton import L_HIP, L_SHOULDER, LSP14, R_HIP, R_SHOULDER
-from models.training.dataset import MP33_LIMBS, LabelledCrop, load
-from models.training.teachers import BlazePose
+from library_store.skeleton import LSP14
+from models.training.dataset import MP33_LIMBS, TORSO, LabelledCrop, load
+from models.training.teachers import BlazePose, circle
 
 Floats = NDArray[np.float64]
 
@@ -27,8 +27,6 @@ AGREED = 0.25
 """Distance of the teacher's joint from the label's over the trunk's length, at most."""
 SURE = 0.5
 """Least presence that the teacher gives to the person."""
-ROOM = 1.2
-"""Radius of the circle around the person over the farthest joint's distance from the hips."""
 
 
 def depths_px(crop: LabelledCrop, teacher: BlazePose) -> NDArray[np.float32]:
@@ -36,16 +34,14 @@ def depths_px(crop: LabelledCrop, teacher: BlazePose) -> NDArray[np.float32]:
     unknown = np.full(LSP14.n_joints, np.nan, np.float32)
     if not crop.has_torso:
         return unknown
-    joints = crop.joints_px.astype(np.float64)
-    hips = 0.5 * (joints[R_HIP] + joints[L_HIP])
-    trunk = 0.5 * (joints[R_SHOULDER] + joints[L_SHOULDER]) - hips
-    length = float(np.linalg.norm(trunk))
-    if length < 1.0:
+    about = circle(crop.joints_px, crop.weight > 0)
+    if about is None:
         return unknown
-    reach = ROOM * np.linalg.norm(joints[crop.weight > 0] - hips, axis=1).max()
-    seen = teacher.person(crop.image, hips, hips + trunk * (reach / length))
+    seen = teacher.person(crop.image, *about)
     limbs = list(MP33_LIMBS)
-    apart = np.linalg.norm(seen.landmarks_px[limbs] - joints[2:], axis=1)
+    apart = np.linalg.norm(seen.landmarks_px[limbs] - crop.joints_px[2:], axis=1)
+    shoulders, hips = (crop.joints_px[list(pair)].mean(0) for pair in (TORSO[:2], TORSO[2:]))
+    length = np.linalg.norm(shoulders - hips)
     agreed = (apart < AGREED * length) & (crop.weight[2:] > 0) & (seen.score > SURE)
     unknown[2:] = np.where(agreed, seen.depths_px[limbs], np.nan)
     return unknown

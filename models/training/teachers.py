@@ -15,12 +15,16 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
+from library_store.skeleton import L_HIP, L_SHOULDER, R_HIP, R_SHOULDER
 from models.crop import warped
 from models.person_detector import iou
 from models.training.dataset import Image
 
 DETECTOR_SIZE = 224
 LANDMARK_SIZE = 256
+ROOM = 1.2
+"""Radius of the circle around a person over the farthest joint's distance from the hips."""
+_LEAST_TRUNK_PX = 1.0
 _EARS, _SHOULDERS = (7, 8), (11, 12)
 _BODY = (11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)
 
@@ -46,6 +50,23 @@ class TeacherPose:
     landmarks_mm: NDArray[np.float64]
     depths_px: NDArray[np.float64]
     score: float
+
+
+def circle(
+    joints_px: NDArray[np.floating], known: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Mid-hip (2,) and rim (2,), up along the trunk, of the circle about a person with a trunk.
+
+    Of joints (14, 2) and which of them are known; None where the trunk has no length.
+    """
+    joints = joints_px.astype(np.float64)
+    hips = 0.5 * (joints[R_HIP] + joints[L_HIP])
+    trunk = 0.5 * (joints[R_SHOULDER] + joints[L_SHOULDER]) - hips
+    length = float(np.linalg.norm(trunk))
+    if length < _LEAST_TRUNK_PX:
+        return None
+    reach = ROOM * np.linalg.norm(joints[known] - hips, axis=1).max()
+    return hips, hips + trunk * (reach / length)
 
 
 def onnx_session(path: Path) -> ort.InferenceSession:
