@@ -153,6 +153,9 @@ class ModelCard(_Frozen):
         default_factory=dict,
         description="CPU-ms an input, one thread, by 'provider/precision'; posematch model check",
     )
+    cost_cpu: dict[str, str] = Field(
+        default_factory=dict, description="the CPU that each of cost_ms was measured on"
+    )
     output: Annotated[PoseOutput | DetectorOutput | LiftOutput, Field(discriminator="kind")]
     training_data: list[str]
     licence: str

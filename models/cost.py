@@ -8,12 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from models.card import DetectorOutput, PoseOutput
+from models.card import DetectorOutput, ModelCard, PoseOutput
 from models.looks import usual
 from models.person_detector import shrunk
+from models.providers import cpu_features, cpu_name
 from models.session import OnnxModel, made_up_joints
 
 WARM_UP_RUNS = 5
+MATRIX_FEATURES = ("amx_int8", "avx512_vnni", "avx_vnni", "avx2", "asimddp")
+"""What makes 8-bit networks fast, the fastest first."""
 ENOUGH_S, LEAST_RUNS = 20.0, 3
 """Networks for GPUs take seconds a crop on a CPU: then a few runs must do."""
 
@@ -45,3 +48,12 @@ def cpu_ms(model: OnnxModel, runs: int = 60) -> float:
             break
     runs_each = usual(output.looks) if isinstance(output, PoseOutput) else 1.0
     return 1e3 * runs_each * min(spent_s[WARM_UP_RUNS:] or spent_s[1:])
+
+
+def with_cost(card: ModelCard, model: OnnxModel) -> ModelCard:
+    """The card with what its network costs here, and on which CPU that is."""
+    runtime = str(model.runtime)
+    best = next((name for name in MATRIX_FEATURES if name in cpu_features()), None)
+    cpu = cpu_name() if best is None else f"{cpu_name()}, {best}"
+    costs = card.cost_ms | {runtime: round(cpu_ms(model), 2)}
+    return card.model_copy(update={"cost_ms": costs, "cost_cpu": card.cost_cpu | {runtime: cpu}})

@@ -45,20 +45,35 @@ class Runtime:
         return f"{self.provider}/{self.precision}"
 
 
+CPUINFO = Path("/proc/cpuinfo")
+
+
 @cache
-def cpu_features(cpuinfo: Path = Path("/proc/cpuinfo")) -> frozenset[str]:
+def cpu_features(cpuinfo: Path = CPUINFO) -> frozenset[str]:
     """What the first core says it can; empty where the system does not tell."""
-    try:
-        text = cpuinfo.read_text()
-    except OSError:
+    if not cpuinfo.exists():
         # Every ARM core of a Mac has the dot products.
         arm = platform.system() == "Darwin" and platform.machine() == "arm64"
         return frozenset({"asimddp"} if arm else ())
+    return frozenset(_first_core(cpuinfo, {"flags", "Features"}).split())
+
+
+def cpu_name(cpuinfo: Path = CPUINFO) -> str:
+    """What the first core calls itself, or else its architecture."""
+    return _first_core(cpuinfo, {"model name"}) or platform.machine()
+
+
+def _first_core(cpuinfo: Path, keys: set[str]) -> str:
+    """The first line with one of these keys; empty where there is none."""
+    try:
+        text = cpuinfo.read_text()
+    except OSError:
+        return ""
     for line in text.splitlines():
         key, _, value = line.partition(":")
-        if key.strip() in {"flags", "Features"}:
-            return frozenset(value.split())
-    return frozenset()
+        if key.strip() in keys:
+            return value.strip()
+    return ""
 
 
 def present_providers(wanted: ProviderChoice = "auto") -> tuple[Provider, ...]:

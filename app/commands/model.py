@@ -20,7 +20,7 @@ from models.caffe import LICENCE, JointOrder
 from models.caffe import import_caffe as import_network
 from models.card import read_card, write_card
 from models.choice import cards_of
-from models.cost import cpu_ms
+from models.cost import with_cost
 from models.pose_lifter import lifter_names
 from models.session import OnnxModel
 
@@ -77,7 +77,7 @@ def print_card(
             "unknown" if card.accuracy is None else f"{card.accuracy:.3f}",
             f"{card.gflop:.2f}",
             f"{card.parameters:,}",
-            _costs(card.cost_ms),
+            _costs(card),
         )
     output.print(table)
 
@@ -103,19 +103,17 @@ def check(
     for card in _all_cards(settings) if name is None else [_card(settings, name)]:
         runs_on = "cpu" if card.output.kind == "lift" else wanted
         model = OnnxModel(settings.weights_dir, card.name, provider=runs_on)
-        spent_ms = round(cpu_ms(model), 2)
+        measured = with_cost(card, model)
         stated = card.cost_ms.get(str(model.runtime))
         table.add_row(
             f"{escape(card.name)} {escape(card.version)}",
             str(model.runtime),
             _input(card),
-            f"{spent_ms:.2f}",
+            f"{measured.cost_ms[str(model.runtime)]:.2f}",
             "-" if stated is None else f"{stated:.2f}",
         )
         if save:
-            costs = card.cost_ms | {str(model.runtime): spent_ms}
-            path = settings.weights_dir / f"{card.name}.json"
-            write_card(path, card.model_copy(update={"cost_ms": costs}))
+            write_card(settings.weights_dir / f"{card.name}.json", measured)
     output.print(table)
 
 
@@ -296,8 +294,13 @@ def _input(card: ModelCard) -> str:
     return "2D joints" if side_px is None else f"{side_px} px"
 
 
-def _costs(cost_ms: dict[str, float]) -> str:
-    return ", ".join(f"{cost:.1f} {runtime}" for runtime, cost in cost_ms.items()) or "unknown"
+def _costs(card: ModelCard, *, where: bool = False) -> str:
+    """What an input costs by runtime; ``where``: and on which CPU that was."""
+    told = []
+    for runtime, cost in card.cost_ms.items():
+        cpu = card.cost_cpu.get(runtime, "unknown CPU")
+        told.append(f"{cost:.1f} {runtime}" + (f" ({cpu})" if where else ""))
+    return ", ".join(told) or "unknown"
 
 
 def _card_table(card: ModelCard) -> Table:
@@ -312,7 +315,7 @@ def _card_table(card: ModelCard) -> Table:
         "input": _input(card),
         "cost": f"{card.gflop:.2f} GFLOP, {card.multiply_adds / 1e9:.2f} GMAC, "
         f"{card.parameters:,} parameters",
-        "CPU-ms an input": _costs(card.cost_ms),
+        "CPU-ms an input": _costs(card, where=True),
         "learned from": "\n".join(card.training_data),
         "licence": card.licence,
         "limits": "\n".join(card.limits),

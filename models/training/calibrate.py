@@ -24,7 +24,7 @@ from models.card import (
     read_card,
     write_card,
 )
-from models.cost import cpu_ms
+from models.cost import with_cost
 from models.heatmaps import Floats, calibrated, read_maps
 from models.looks import looked_at
 from models.pck import correct_keypoints
@@ -200,7 +200,6 @@ def main() -> None:
         update={
             "measured": measured,
             "accuracy": measured.get(RANKED_BY),
-            "cost_ms": card.cost_ms | {str(model.runtime): round(cpu_ms(model), 2)},
             "output": output.model_copy(
                 update={
                     "confidence": ConfidenceCalibration(
@@ -217,7 +216,7 @@ def main() -> None:
             ),
         }
     )
-    write_card(path, updated)
+    write_card(path, with_cost(updated, model))
     if args.figure:
         draw_reliability(args.figure, stated, check, tuple(output.joint_names))
     outside = check.judged & ~check.labelled

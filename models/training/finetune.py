@@ -184,6 +184,7 @@ def finetune(
                 "limits": before_card.limits,
                 "licence": f"{before_card.licence}; and whatever {source} demands",
                 "cost_ms": before_card.cost_ms,
+                "cost_cpu": before_card.cost_cpu,
             }
         ),
         out,

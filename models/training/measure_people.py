@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from models.card import WEIGHTS_DIR, read_card, write_card
-from models.cost import cpu_ms
+from models.cost import with_cost
 from models.person_detector import PersonDetector, corners, iou
 from models.session import OnnxModel
 from models.training.scenes import LabelledScene, read_scenes
@@ -60,10 +60,10 @@ def main() -> None:
         "command": "python -m models.training.measure_people --scenes SCENES --scenes-labels FILE",
     }
     model = OnnxModel(args.weights, args.name)
-    cost_ms = card.cost_ms | {str(model.runtime): round(cpu_ms(model), 2)}
-    update = {"measured": measured, "accuracy": round(recall, 4), "cost_ms": cost_ms}
-    write_card(path, card.model_copy(update=update))
-    print(measured | cost_ms)
+    update = {"measured": measured, "accuracy": round(recall, 4)}
+    card = with_cost(card.model_copy(update=update), model)
+    write_card(path, card)
+    print(measured | card.cost_ms)
 
 
 if __name__ == "__main__":

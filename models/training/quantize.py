@@ -231,6 +231,7 @@ def quantize(directory: Path, name: str, images: Images) -> ModelCard:
             "providers": ("openvino", "cpu"),
             "cpu_features": INT8_FEATURES,
             "cost_ms": {},
+            "cost_cpu": {},
             "accuracy": None,
             "measured": {},
         }

@@ -13,6 +13,7 @@ from typer.testing import CliRunner, Result
 from app.cli import cli
 from models import ModelError
 from models.card import WEIGHTS_DIR, read_card
+from models.providers import cpu_name
 from tests.models.caffe import caffe_files
 from tests.models.training import user_files
 
@@ -59,7 +60,10 @@ def test_check_measures_and_may_write_the_cost_into_the_card(weights: Path) -> N
     assert invoke("check", "person").exit_code == 0
     assert read_card(weights / "person.json") == before
     assert invoke("check", "person", "--provider", "cpu", "--save").exit_code == 0
-    assert 0 < read_card(weights / "person.json").cost_ms["cpu/fp32"] < 1000
+    after = read_card(weights / "person.json")
+    assert 0 < after.cost_ms["cpu/fp32"] < 1000
+    assert after.cost_cpu["cpu/fp32"].startswith(cpu_name())
+    assert cpu_name() in " ".join(invoke("card", "person").stdout.split())
 
 
 def test_check_refuses_a_file_that_is_not_its_cards(weights: Path) -> None:

@@ -1,5 +1,6 @@
 """Which card and which provider are taken: by what is installed, the CPU and the budget."""
 
+import platform
 from pathlib import Path
 
 import onnxruntime as ort
@@ -8,7 +9,7 @@ import pytest
 from models import ModelError
 from models.card import WEIGHTS_DIR, read_card
 from models.choice import choose
-from models.providers import cpu_features, runtime_of
+from models.providers import cpu_features, cpu_name, runtime_of
 from models.session import runtimes
 from tests.models import tiny_onnx
 
@@ -87,11 +88,14 @@ def test_no_card_of_that_kind(cards: Path) -> None:
 
 def test_features_of_a_cpu(tmp_path: Path) -> None:
     info = tmp_path / "cpuinfo"
-    info.write_text("processor\t: 0\nflags\t\t: fpu avx512_vnni amx_bf16\n\nprocessor : 1\n")
+    flags = "flags\t\t: fpu avx512_vnni amx_bf16"
+    info.write_text(f"processor\t: 0\nmodel name\t: Big 9: one\n{flags}\n\nprocessor : 1\n")
     assert cpu_features(info) == {"fpu", "avx512_vnni", "amx_bf16"}
+    assert cpu_name(info) == "Big 9: one"
     info = tmp_path / "arm"
     info.write_text("processor\t: 0\nFeatures\t: fp asimd asimddp\n")
     assert cpu_features(info) == {"fp", "asimd", "asimddp"}
+    assert cpu_name(info) == cpu_name(tmp_path / "none") == platform.machine()
 
 
 @pytest.mark.parametrize("kind", ["pose", "people"])
