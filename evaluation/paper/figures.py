@@ -20,7 +20,6 @@ from app.lifting.types import Intrinsics, LiftedPerson, Method
 from app.pipeline import PhotoResult, SeenPerson
 from evaluation.metrics import align, rigid_error_mm
 from evaluation.paper.study import TestSet
-from library_store.library import Library
 
 SIDE_PX = 420
 _GROUND = 236
@@ -38,83 +37,83 @@ class Shown:
     method: Method
 
 
-def failure(test: TestSet, source: str, library: Library) -> Picture:
+def failure(test: TestSet, source: str, lifter: Lifter) -> Picture:
     """Figure 2: worse by the default method than 19 of 20 people (the very worst are freaks)."""
-    row = _at_share(test, source, library, 0.95)
-    return _line(test, library, Shown(row, source, "fusion"), "default method, against the truth")
+    row = _at_share(test, source, lifter, 0.95)
+    return _line(test, lifter, Shown(row, source, "fusion"), "default method, against the truth")
 
 
-def warp(test: TestSet, library: Library) -> Picture:
+def warp(test: TestSet, lifter: Lifter) -> Picture:
     """Figure 3: the warp of the person in the middle of the default method's errors."""
-    row = _at_share(test, "gt", library, 0.5)
+    row = _at_share(test, "gt", lifter, 0.5)
     shown = Shown(row, "gt", "paper")
-    return _line(test, library, shown, "X* (colour) and the exemplar X (grey)", before=True)
+    return _line(test, lifter, shown, "X* (colour) and the exemplar X (grey)", before=True)
 
 
-def typical(test: TestSet, source: str, library: Library) -> list[Picture]:
+def typical(test: TestSet, source: str, lifter: Lifter) -> list[Picture]:
     """Figure 4: people at a quarter, half and three quarters of the errors."""
     return [
         _line(
             test,
-            library,
-            Shown(_at_share(test, source, library, share), source, "fusion"),
+            lifter,
+            Shown(_at_share(test, source, lifter, share), source, "fusion"),
             f"default method, better than {1 - share:.0%} of the errors",
         )
         for share in (0.25, 0.5, 0.75)
     ]
 
 
-def side_by_side(test: TestSet, source: str, library: Library) -> list[Picture]:
+def side_by_side(test: TestSet, source: str, lifter: Lifter) -> list[Picture]:
     """Figures 5 and 6: the paper's method and the default one on the same 2D."""
-    row = _at_share(test, source, library, 0.6)
+    row = _at_share(test, source, lifter, 0.6)
     return [
-        _line(test, library, Shown(row, source, method), f"{method}, given {source}")
+        _line(test, lifter, Shown(row, source, method), f"{method}, given {source}")
         for method in ("paper", "fusion")
     ]
 
 
-def liftable(test: TestSet, source: str, library: Library) -> bool:
+def liftable(test: TestSet, source: str, lifter: Lifter) -> bool:
     """Whether there is anybody to draw."""
-    return source in test.seen and bool(_errors(test, source, library)[1])
+    return source in test.seen and bool(_errors(test, source, lifter)[1])
 
 
-def _at_share(test: TestSet, source: str, library: Library, share: float) -> int:
+def _at_share(test: TestSet, source: str, lifter: Lifter, share: float) -> int:
     """The person at this share of the default method's errors."""
-    rows, errors = _errors(test, source, library)
+    rows, errors = _errors(test, source, lifter)
     return rows[int(np.argsort(errors)[min(int(share * len(rows)), len(rows) - 1)])]
 
 
-def _errors(test: TestSet, source: str, library: Library) -> tuple[list[int], list[float]]:
+def _errors(test: TestSet, source: str, lifter: Lifter) -> tuple[list[int], list[float]]:
     """Rows and P1 by the default method, of about a hundred people whom both methods lift."""
     rows, errors = [], []
     for row in range(0, len(test.views), max(1, len(test.views) // PEOPLE)):
-        person = _try(test, library, Shown(row, source, "fusion"))
-        if person is not None and _try(test, library, Shown(row, source, "paper")) is not None:
+        person = _try(test, lifter, Shown(row, source, "fusion"))
+        if person is not None and _try(test, lifter, Shown(row, source, "paper")) is not None:
             truth = test.views.joints_mm[row]
             rows.append(row)
             errors.append(float(rigid_error_mm(person.joints_3d_mm, truth).mean()))
     return rows, errors
 
 
-def _try(test: TestSet, library: Library, shown: Shown) -> LiftedPerson | None:
+def _try(test: TestSet, lifter: Lifter, shown: Shown) -> LiftedPerson | None:
     camera = test.views.camera_of(shown.row)
     person = test.seen[shown.source].observation(shown.row, plain=shown.method == "paper")
-    (lifted,) = Lifter(library).lift([person], camera.intrinsics, method=shown.method)
+    (lifted,) = lifter.lift([person], camera.intrinsics, method=shown.method)
     return lifted if isinstance(lifted, LiftedPerson) else None
 
 
-def _lift(test: TestSet, library: Library, shown: Shown) -> LiftedPerson:
-    person = _try(test, library, shown)
+def _lift(test: TestSet, lifter: Lifter, shown: Shown) -> LiftedPerson:
+    person = _try(test, lifter, shown)
     if person is None:
         raise RuntimeError(f"person {shown.row} cannot be lifted")
     return person
 
 
 def _line(
-    test: TestSet, library: Library, shown: Shown, title: str, *, before: bool = False
+    test: TestSet, lifter: Lifter, shown: Shown, title: str, *, before: bool = False
 ) -> Picture:
     """The 2D and two novel views of one person, side by side."""
-    person = _lift(test, library, shown)
+    person = _lift(test, lifter, shown)
     truth = test.views.joints_mm[shown.row]
     answer = person.joints_3d_mm
     error = float(rigid_error_mm(answer, truth).mean())

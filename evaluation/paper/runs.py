@@ -12,6 +12,7 @@ import numpy as np
 from app.commands.console import stage_progress
 from app.drawing.picture import Picture
 from app.drawing.svg import to_svg
+from app.lifting.lifter import Lifter
 from evaluation.metrics import rigid_error_mm, root_centred_error_mm
 from evaluation.paper import figures, published, report, study
 from evaluation.paper.chart import chart
@@ -28,7 +29,7 @@ from evaluation.paper.datasets import (
 from evaluation.paper.exemplars import exemplars_of, fraction, write_library
 from evaluation.paper.network import Network
 from evaluation.paper.study import TestSet
-from evaluation.paper.systems import Seen2D, System, default_method, learned, paper_method
+from evaluation.paper.systems import Seen2D, System, learned, ours, paper_method
 from evaluation.paper.videos import find_videos, look_at_videos
 from evaluation.paper.views import (
     FIRST_VIRTUAL,
@@ -42,6 +43,7 @@ from evaluation.paper.views import (
 from evaluation.protocols import load_lifting_set
 from library_store.importers.h36m import CAMERAS
 from library_store.library import Library, load
+from models.pose_lifter import PoseLifter
 
 P1_SECONDS, P2_SECONDS = 64 / 50, 0.1
 """Every 64th frame of 50 Hz; 10 frames a second."""
@@ -61,6 +63,7 @@ class Options:
     seed: int
     library: Path | None
     mlp: Path | None
+    network: PoseLifter | None
 
     def rng(self) -> np.random.Generator:
         """Anew for every draw, so that none depends on which were made before."""
@@ -259,7 +262,7 @@ def _all_tables(told: Report, data: Protocols, options: Options) -> None:
     if options.library is not None:
         own = load(options.library, backend="exact")
         _curves(told, shown, own, own.manifest.name, "-own", options)
-    _figures(told, shown, library)
+    _figures(told, shown, Lifter(library, network=options.network))
 
 
 def _curves(
@@ -277,7 +280,7 @@ def _curves(
                 return load(library.directory, verify=False, backend="exact")
             return write_library(Path(folder) / str(size), fraction(library, size, options.seed))
 
-        curve = study.size_curve(test, study.sizes_up_to(len(library)), library_of)
+        curve = study.size_curve(test, study.sizes_up_to(len(library)), library_of, options.network)
     told.say(f"## Figures 7 and 8: protocol 1 by library size, {name} ({len(rows):,} views)")
     for number, kind, lines in ((7, "mean", curve.mean), (8, "median", curve.median)):
         title = f"{kind} P1 by library size: {name}"
@@ -290,18 +293,18 @@ def _curves(
         told.say(report.size_table(curve, "X*|x"))
 
 
-def _figures(told: Report, p1: TestSet, library: Library) -> None:
+def _figures(told: Report, p1: TestSet, lifter: Lifter) -> None:
     told.say("## Figures 2 to 6: people (training frames as library)")
-    source = "x" if figures.liftable(p1, "x", library) else "gt"
-    told.draw("figure2", figures.failure(p1, source, library), "Figure 2: a failure")
-    told.draw("figure3", figures.warp(p1, library), "Figure 3: the warp")
-    for number, picture in enumerate(figures.typical(p1, source, library)):
+    source = "x" if figures.liftable(p1, "x", lifter) else "gt"
+    told.draw("figure2", figures.failure(p1, source, lifter), "Figure 2: a failure")
+    told.draw("figure3", figures.warp(p1, lifter), "Figure 3: the warp")
+    for number, picture in enumerate(figures.typical(p1, source, lifter)):
         told.draw(f"figure4{'abc'[number]}", picture, "Figure 4: answers")
     for number, given in ((5, "x"), (6, "gt")):
-        if not figures.liftable(p1, given, library):
+        if not figures.liftable(p1, given, lifter):
             told.missing.append(f"figure {number}: nobody can be lifted given {given}")
         else:
-            for letter, picture in zip("ab", figures.side_by_side(p1, given, library), strict=True):
+            for letter, picture in zip("ab", figures.side_by_side(p1, given, lifter), strict=True):
                 caption = f"Figure {number}: the paper's method and the default, given {given}"
                 told.draw(f"figure{number}{letter}", picture, caption)
 
@@ -316,16 +319,18 @@ def _table9(
 
 def _systems(frames: Library, options: Options) -> list[System]:
     """The paper's method on training frames first; then ours, and what the options add."""
-    systems = [
-        System("paper's method, training frames", paper_method(frames)),
-        System("default by matching alone, training frames", default_method(frames)),
-    ]
+    libraries = {"training frames": frames}
     if options.library is not None:
         own = load(options.library, backend="exact")
-        systems += [
-            System(f"paper's method, {own.manifest.name}", paper_method(own)),
-            System(f"default by matching alone, {own.manifest.name}", default_method(own)),
-        ]
+        libraries[own.manifest.name] = own
+    systems = [
+        System(f"{label}, {name}", lift)
+        for name, library in libraries.items()
+        for label, lift in (
+            ("paper's method", paper_method(library)),
+            *ours(library, options.network).items(),
+        )
+    ]
     if options.mlp is not None:
         network = Network.load(options.mlp)
         systems += [

@@ -17,13 +17,14 @@ from evaluation.paper.published import Row
 from evaluation.paper.systems import (
     Seen2D,
     System,
-    default_method,
     known_depths,
     optimal_exemplars,
+    ours,
     paper_method,
 )
 from evaluation.paper.views import Views
 from library_store.library import Library
+from models.pose_lifter import PoseLifter
 
 Error = Callable[[Floats, Floats], Floats]
 
@@ -126,8 +127,9 @@ def size_curve(
     test: TestSet,
     sizes: Sequence[int],
     library_of: Callable[[int], Library],
+    network: PoseLifter | None,
 ) -> Curve:
-    """Figures 7 and 8: every variant of the paper, and the default method, by library size."""
+    """Figures 7 and 8: every variant of the paper, and ours, by library size."""
     curve = Curve(tuple(sizes))
     for size in sizes:
         library = library_of(size)
@@ -137,9 +139,8 @@ def size_curve(
             paper = paper_method(library)(test.views, seen)
             found[f"X|{source}"] = _p1(paper.exemplar_mm, test)
             found[f"X*|{source}"] = _p1(paper.answer_mm, test)
-            found[f"default|{source}"] = _p1(
-                default_method(library)(test.views, seen).answer_mm, test
-            )
+            for name, lift in ours(library, network).items():
+                found[f"{name}|{source}"] = _p1(lift(test.views, seen).answer_mm, test)
         exemplars = optimal_exemplars(library, test.views)
         found["X|GT"] = _p1(exemplars, test)
         warped = known_depths(test.views, test.seen["gt"], exemplars)

@@ -107,6 +107,12 @@ def default_method(library: Library, network: PoseLifter | None = None) -> Lift:
     return _by_lifter(library, "fusion", LiftingSettings(), network)
 
 
+def ours(library: Library, network: PoseLifter | None) -> dict[str, Lift]:
+    """The default method, and matching alone; without a network these are one."""
+    alone = {"matching alone": default_method(library)}
+    return alone if network is None else {"default": default_method(library, network)} | alone
+
+
 def learned(network: Network, *, warped: bool) -> Lift:
     """The MLP's answer, or that put onto the joints' rays."""
 

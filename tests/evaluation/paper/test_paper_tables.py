@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from app.errors import PoseMatchError
+from app.lifting.lifter import Lifter
 from evaluation.metrics import rigid_error_mm, root_centred_error_mm
 from evaluation.paper import figures, study
 from evaluation.paper.__main__ import main
@@ -32,6 +33,7 @@ from library_store.importers import Clip, write_npz
 from library_store.importers.h36m import CAMERAS, H36M_32
 from library_store.importers.rotation import up_to_y
 from models.card import WEIGHTS_DIR
+from models.errors import ModelError
 from tests.evaluation.paper.made_data import (
     DISTANCE_MM,
     acting,
@@ -71,6 +73,9 @@ def test_every_table_of_a_users_folder(users_folder: Path, tmp_path: Path) -> No
     assert "* HumanEva, 15 joints: metres, Z up (clips: 12)" in text
     assert "video of S9_Walking, camera" in text
     assert text.count("action '_ALL': not in the paper") == 1
+    for row in ("default, training frames", "matching alone, training frames"):
+        assert text.count(f"| **{row}") == 6, "tables 1, 2, 4, the one after it, 5 and 9"
+    assert "| default given gt |" in text
     for by_action, short in (("Table 1:", "X* given x"), ("Table 2:", "X* given gt")):
         # The same method on the same people.
         table = text.split(by_action)[1].split("##")[0]
@@ -138,11 +143,11 @@ def test_a_file_that_is_not_there_is_named_at_once(
     assert f"{option} {tmp_path / 'none'} does not exist" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("option", ["--library", "--mlp", "--cross-set"])
+@pytest.mark.parametrize("option", ["--library", "--mlp", "--cross-set", "--network"])
 def test_a_file_that_is_no_good_is_named_at_once(tmp_path: Path, option: str) -> None:
     bad, out = tmp_path / "bad", tmp_path / "out"
     bad.write_text("not what is wanted")
-    with pytest.raises((PoseMatchError, LibraryError), match="bad"):
+    with pytest.raises((PoseMatchError, LibraryError, ModelError), match="bad"):
         main(["--data", str(tmp_path), "--out", str(out), option, str(bad)])
     assert not out.exists()
 
@@ -220,6 +225,8 @@ def test_tables_of_free_mocap(tmp_path: Path) -> None:
     text = (out / "report.md").read_text()
     assert "| | Run | **Avg.** | Median |" in text
     assert "table 9: no --cross-set" in text
+    assert "| **matching alone, training frames** |" in text
+    assert "**default" not in text, "the network that ships has seen these people"
     assert "CMU subject cmu_05" in text
     found, held_out = find_cmu(mocap)
     assert {scene.clip.subject for scene in found.of(held_out)} == {"cmu_35"}
@@ -326,9 +333,10 @@ def test_drawn_is_who_both_methods_lift(users_folder: Path, tmp_path: Path) -> N
     unseen[:, 4] = 0.0
     sharp = np.broadcast_to(np.eye(2), (*points.shape, 2))
     test = study.TestSet(views, {"x": Seen2D(points, unseen, sharp)}, ("Walk",))
-    assert figures.liftable(test, "x", library)
+    lifter = Lifter(library)
+    assert figures.liftable(test, "x", lifter)
     points[:, 4] = 1e5
-    assert not figures.liftable(test, "x", library)
+    assert not figures.liftable(test, "x", lifter)
 
 
 def test_what_a_network_says_of_a_person_is_lifted_with_them() -> None:
