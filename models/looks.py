@@ -55,7 +55,7 @@ FURTHER = (
     Look(mirrored=True, zoom=1.0, below=0.52, share=0.58),
     Look(mirrored=False, zoom=0.5**0.5, below=0.25, share=0.12),
 )
-"""Who is spared a look would gain next to nothing by it (docs/training.md). The third sees the
+"""Who is spared a look would gain next to nothing by it (docs/experiments.md). The third sees the
 corners of a turned crop too."""
 MIRROR = (*LSP14.mirror, LSP14.n_joints)
 """Maps of the mirrored person, the background's last."""

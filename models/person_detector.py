@@ -26,7 +26,7 @@ MAX_OVERLAP = 0.5
 WEAK, SURE, MAX_WITHIN = 0.45, 0.7, 0.25
 """A box of less score than the first adds nobody if more than the last of its own area lies within
 one of at least the second: a face before foliage may pass for somebody who lies there. Of held-out
-people it costs one in 1,241 (docs/training.md)."""
+people it costs one in 1,241 (docs/experiments.md)."""
 
 CLOSE_MARGIN, CLOSE_SHARE = 0.17, 0.5
 """The second pass' margin around the photo, of the canvas; the least share of the photo's width or

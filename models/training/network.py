@@ -134,7 +134,7 @@ class DepthHead(nn.Module):
     Depths are less the hip midpoint's, over the crop's side. Features are read where the last stage
     believes the joints, and of all of them at once: which leg is the nearer one shows at the hips,
     and at the knee that hides the other. A map of depths read at each joint (Mehta et al. 2017)
-    tells less on the same features: docs/training.md.
+    tells less on the same features: docs/experiments.md.
     """
 
     WIDTHS = (192, 128)
