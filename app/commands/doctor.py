@@ -209,10 +209,11 @@ def _port(settings: Settings) -> Finding:
 
 
 def _answers(settings: Settings) -> bool:
-    """Whether a posematch is what listens there."""
+    """Whether a posematch is what listens there, asked without the environment's proxy."""
     host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(settings.host, settings.host)
+    directly = request.build_opener(request.ProxyHandler({}))
     try:
-        with request.urlopen(f"http://{host}:{settings.port}/openapi.json", timeout=2) as answer:
+        with directly.open(f"http://{host}:{settings.port}/openapi.json", timeout=2) as answer:
             document = json.load(answer)
     except (OSError, ValueError, HTTPException):
         return False

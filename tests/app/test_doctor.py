@@ -101,13 +101,16 @@ def test_a_cache_that_cannot_even_be_looked_for(tmp_path: Path) -> None:
     assert findings["library"]["state"] == "warning"
 
 
-def test_the_port(tmp_path: Path, server: Server) -> None:
+def test_the_port(tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         findings = examine(1, port=taken.getsockname()[1], cache_dir=tmp_path)
     assert findings["port"]["state"] == "failure"
     assert "POSEMATCH_PORT" in findings["port"]["mend"]
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")  # not asked about this machine
+    monkeypatch.setenv("no_proxy", "")
+    monkeypatch.setattr("urllib.request._opener", None)  # made before, it knows of none
     findings = examine(0, port=server.port, cache_dir=tmp_path)
     assert "already serving" in findings["port"]["said"]
 
