@@ -40,8 +40,8 @@ State = Literal["ok", "warning", "failure"]
 _COLOURS: dict[State, str] = {"ok": "green", "warning": "yellow", "failure": "red"}
 
 SERVING_BYTES = 450_000_000
-"""Memory of a serving process with the default library, with room for a few large photos."""
-BUILDING_BYTES = 1_500_000_000
+"""Memory of a serving process with the default library, with room for a few large photos; a build
+of that library takes less."""
 LIBRARY_BYTES = 250_000_000
 """Disk space a build of the default library takes while it runs."""
 
@@ -91,7 +91,7 @@ def examine() -> Iterator[Finding]:
         return
     yield _settings()
     yield _cpu()
-    yield _memory(settings)
+    yield _memory()
     yield _cache(settings)
     yield _disk(settings)
     yield _port(settings)
@@ -136,24 +136,22 @@ def _cpu() -> Finding:
     )
 
 
-def _memory(settings: Settings) -> Finding:
+def _memory() -> Finding:
     free = memory()
     if free is None:
         return Finding(
             "memory", "warning", "unknown here", f"see that {_mb(SERVING_BYTES)} are free"
         )
-    wanted = SERVING_BYTES if _is_library_there(settings) else BUILDING_BYTES
     said = f"{_mb(free.available_bytes)} free"
     if free.container_limit_bytes is not None:
         said += f", this container's limit is {_mb(free.container_limit_bytes)}"
-    if free.available_bytes >= wanted:
+    if free.available_bytes >= SERVING_BYTES:
         return Finding("memory", "ok", said)
-    what = "serving" if wanted == SERVING_BYTES else "building the library"
     return Finding(
         "memory",
         "warning",
         said,
-        f"{what} takes {_mb(wanted)}; free some, or raise the limit",
+        f"serving takes {_mb(SERVING_BYTES)}; free some, or raise the limit",
     )
 
 
