@@ -50,17 +50,17 @@ def problem_response(error: RequestError, request_id: str) -> Response:
 
 def invalid_input(error: ValidationError | RequestValidationError) -> InvalidInputError:
     """Pydantic's complaints, naming each value by where the client wrote it."""
+    # FastAPI's begin with the part of the request: "query", which is a name to the client too.
+    first = 1 if isinstance(error, RequestValidationError) else 0
     return InvalidInputError(
         [
-            (_where(item["loc"]), item["msg"].removeprefix("Value error, "))
+            (
+                ".".join(map(str, item["loc"][first:])) or "request",
+                item["msg"].removeprefix("Value error, "),
+            )
             for item in error.errors()
         ]
     )
-
-
-def _where(location: tuple[int | str, ...]) -> str:
-    parts = [str(part) for part in location if part not in {"query", "body", "path"}]
-    return ".".join(parts) or "request"
 
 
 def install(app: FastAPI) -> None:

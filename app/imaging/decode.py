@@ -152,8 +152,13 @@ def _reduction(header: ImageHeader, long_side_px: int, wanted_px: int) -> int:
 def _decode(data: bytes, header: ImageHeader, reduction: int) -> npt.NDArray[np.uint8]:
     """Stored pixels, not turned, as (h, w, 3) BGR uint8."""
     flags = cv2.IMREAD_UNCHANGED if header.has_alpha else _REDUCED[reduction]
+    flags |= cv2.IMREAD_IGNORE_ORIENTATION
+    if header.needless:
+        starts, ends = zip(*header.needless, strict=True)
+        kept = zip((0, *ends), (*starts, len(data)), strict=True)
+        data = b"".join(data[start:end] for start, end in kept)
     try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
         raise UndecodableImageError(f"the {header.media_type} cannot be decoded") from error
     if pixels is None:

@@ -21,7 +21,12 @@ KNOWN_TYPES = (*_ALWAYS_ACCEPTED, HEIC_TYPE)
 _HEIC_NEEDS = "HEIC, which needs the server's `heic` extra"
 
 _MAX_PIECES = 65_536
+_MAX_SCANS = 64
+"""Of a JPEG. Encoders make about ten; each is a walk over all pixels, for as little as 20 bytes."""
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
+_PNG_NEEDED = frozenset({b"tRNS", b"acTL", b"fcTL", b"fdAT"})
+"""Of the ancillary chunks: pixels do not depend on the others, of which libpng inflates each text,
+to 8 MB at most, and complains of each that it does not like."""
 _JPEG_NOT_FILL = re.compile(rb"[^\xff]")
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
 _TEXT = re.compile(rb"[\t-\r\x1b -~]+")
@@ -52,6 +57,7 @@ class ImageHeader:
 
     ``width_px`` and ``height_px`` are those stored, before any EXIF orientation; ``exif`` is the
     TIFF block of the EXIF data; ``has_alpha`` says that some pixels may be transparent.
+    ``needless`` are the bytes, from and to, that a decoder would only lose time on.
     """
 
     media_type: str
@@ -59,6 +65,7 @@ class ImageHeader:
     height_px: int
     exif: bytes | None
     has_alpha: bool
+    needless: tuple[tuple[int, int], ...] = ()
 
 
 def accepted_types() -> tuple[str, ...]:
@@ -114,7 +121,7 @@ def _read_jpeg(data: bytes) -> ImageHeader:
     size: tuple[int, int] | None = None
     exif: bytes | None = None
     position = 2
-    scanned = False
+    n_scans = 0
     for _ in range(_MAX_PIECES):
         position = data.find(b"\xff", position)
         found = _JPEG_NOT_FILL.search(data, position) if position >= 0 else None
@@ -141,12 +148,14 @@ def _read_jpeg(data: bytes) -> ImageHeader:
         elif marker == 0xE1 and segment.startswith(b"Exif\x00\x00") and exif is None:
             exif = segment[6:]
         elif marker == 0xDA:
-            scanned = True
+            n_scans += 1
+            if n_scans > _MAX_SCANS:
+                _corrupt(kind, f"it has more than {_MAX_SCANS} scans")
             found = _JPEG_MARKER.search(data, position)
             position = found.start() if found else len(data)
     else:
         _corrupt(kind, "it has too many segments")
-    if size is None or not scanned:
+    if size is None or n_scans == 0:
         _corrupt(kind, "it holds no image")
     return ImageHeader(kind, size[0], size[1], exif, has_alpha=False)
 
@@ -157,6 +166,7 @@ def _read_png(data: bytes) -> ImageHeader:
     size: tuple[int, int] | None = None
     exif: bytes | None = None
     has_alpha = has_data = False
+    needless: list[tuple[int, int]] = []
     position = len(_PNG_MAGIC)
     for _ in range(_MAX_PIECES):
         length = int.from_bytes(data[position : position + 4], "big")
@@ -182,12 +192,14 @@ def _read_png(data: bytes) -> ImageHeader:
             has_data = True
         elif name == b"IEND":
             break
+        if name[:1].islower() and name not in _PNG_NEEDED:
+            needless.append((position, end))
         position = end
     else:
         _corrupt(kind, "it has too many chunks")
     if size is None or not has_data:
         _corrupt(kind, "it holds no image")
-    return ImageHeader(kind, size[0], size[1], exif, has_alpha)
+    return ImageHeader(kind, size[0], size[1], exif, has_alpha, needless=tuple(needless))
 
 
 def _read_webp(data: bytes) -> ImageHeader:

@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from app.cli import cli
-from app.commands.machine import cpu_flags, describe_cpu, memory
+from app.commands.machine import Memory, cpu_flags, describe_cpu, memory
 from app.settings import Settings
 from tests.app.server import Server, free_port
 
@@ -101,13 +101,16 @@ def test_a_cache_that_cannot_even_be_looked_for(tmp_path: Path) -> None:
     assert findings["library"]["state"] == "warning"
 
 
-def test_the_port(tmp_path: Path, server: Server) -> None:
+def test_the_port(tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         findings = examine(1, port=taken.getsockname()[1], cache_dir=tmp_path)
     assert findings["port"]["state"] == "failure"
     assert "POSEMATCH_PORT" in findings["port"]["mend"]
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")  # not asked about this machine
+    monkeypatch.setenv("no_proxy", "")
+    monkeypatch.setattr("urllib.request._opener", None)  # made before, it knows of none
     findings = examine(0, port=server.port, cache_dir=tmp_path)
     assert "already serving" in findings["port"]["said"]
 
@@ -154,6 +157,17 @@ def test_an_open_door(tmp_path: Path, settings: dict[str, str], state: str) -> N
     finding = examine(0, cache_dir=tmp_path, **settings)["access"]
     assert finding["state"] == state
     assert "0123456789abcdef" not in finding["said"]
+
+
+@pytest.mark.parametrize(("free_mb", "state"), [(400, "warning"), (600, "ok")])
+def test_what_is_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free_mb: int, state: str
+) -> None:
+    """A build takes less than serving does: where there is no library yet, no more is wanted."""
+    monkeypatch.setattr("app.commands.doctor.memory", lambda: Memory(free_mb * 10**6, None))
+    finding = examine(0, cache_dir=tmp_path)["memory"]
+    assert finding["state"] == state
+    assert (finding["mend"] == "") == (state == "ok")
 
 
 def test_the_machine_is_described() -> None:

@@ -125,6 +125,7 @@ def test_pixels_over_the_limit(server: Server) -> None:
         ("subject_height_mm=1.8", "subject_height_mm"),
         ("mirrored=perhaps", "mirrored"),
         ("max_peple=3", "max_peple"),
+        ("path=photo.jpg", "path"),
     ],
 )
 def test_bad_query_values_are_named(server: Server, photo: bytes, query: str, where: str) -> None:

@@ -170,6 +170,7 @@ def test_nobody_and_many(server: Server, renders: list[Render]) -> None:
         ({"focal_length_px": -1}, "focal_length_px"),
         ({"image": {"width_px": 0, "height_px": 5}}, "image.width_px"),
         ({"colour": "red"}, "colour"),
+        ({"body": []}, "body"),
         ({"people": [{"joints_2d": [{"name": "nose", "x_px": 1, "y_px": 2}]}]}, "people"),
         (
             {"people": [{"joints_2d": [{"name": "neck", "x_px": 1, "y_px": 2}] * 2}]},

@@ -68,7 +68,8 @@ def test_the_health_check_tells_a_ready_service_from_none(tmp_path: Path) -> Non
     assert python == "python"
 
     def code(port: int) -> int:
-        environment = {**os.environ, "POSEMATCH_PORT": str(port)}
+        proxy = {"http_proxy": "http://127.0.0.1:9", "no_proxy": ""}  # as Docker may set it
+        environment = {**os.environ, "POSEMATCH_PORT": str(port), **proxy}
         return subprocess.run(
             [sys.executable, *arguments], env=environment, stderr=subprocess.DEVNULL, check=False
         ).returncode

@@ -4,12 +4,13 @@ import { Refusal, curlCommand, estimate, fetchInfo } from "./api.js";
 import { Panels } from "./panels.js";
 import { PhotoView } from "./photo.js";
 import { listenForPhotos } from "./sources.js";
+import { decoded, upright } from "./upright.js";
 import { captionOf, failureInWords, viewInWords } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 
-/** The photo shown and asked about, and what came back. */
-const state = { photo: null, name: "", bitmap: null, answer: null, selected: 0 };
+/** The photo shown and asked about, whether it is known to lie upright, and what came back. */
+const state = { photo: null, name: "", bitmap: null, isUpright: false, answer: null, selected: 0 };
 let stage = null;
 let inFlight = null;
 let turns = 0;
@@ -52,7 +53,7 @@ async function open(source, name) {
   try {
     photo = await source;
     // Not every browser decodes what is dropped here; the service says why it does not either.
-    bitmap = await createImageBitmap(photo, { imageOrientation: "from-image" }).catch(() => null);
+    bitmap = await decoded(photo);
   } catch (error) {
     failure = error;
   }
@@ -60,7 +61,7 @@ async function open(source, name) {
     bitmap?.close();
     return;
   }
-  Object.assign(state, { photo, name, bitmap, answer: null, selected: 0 });
+  Object.assign(state, { photo, name, bitmap, isUpright: false, answer: null, selected: 0 });
   $("welcome").hidden = bitmap !== null;
   photoView.show(bitmap);
   $("photo").setAttribute("aria-label", `The photo ${name}`);
@@ -79,6 +80,7 @@ async function ask() {
   const scan = setTimeout(() => ($("scan").hidden = false), 250);
   caption(`${state.name}: asking …`);
   let answer;
+  let { bitmap } = state;
   try {
     await refuseTooLarge(photo, key);
     answer = await estimate(photo, query, {
@@ -87,6 +89,7 @@ async function ask() {
       onWait: (seconds, problem) =>
         caption(`${problem?.title ?? "Busy"}: asking again in ${Math.ceil(seconds)} s`),
     });
+    if (bitmap && !state.isUpright) bitmap = await upright(bitmap, photo, answer.image).catch(() => bitmap);
   } catch (error) {
     const canBeRead = await isReadable(photo);
     if (mine === inFlight && error.name !== "AbortError") refuse(error, canBeRead);
@@ -95,7 +98,10 @@ async function ask() {
     clearTimeout(scan);
     if (mine === inFlight) $("scan").hidden = true;
   }
-  if (mine === inFlight) show(answer, query, key);
+  if (mine !== inFlight) return;
+  if (bitmap !== state.bitmap) photoView.show(bitmap);
+  Object.assign(state, { bitmap, isUpright: true });
+  show(answer, query, key);
 }
 
 /** A body over the limit is cut off by the server, which browsers report as a lost connection. */

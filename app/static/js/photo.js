@@ -30,7 +30,7 @@ export class PhotoView {
     new ResizeObserver(() => this.#fit()).observe(canvas.parentElement);
   }
 
-  /** Show a photo, upright as the browser decodes it; null when it cannot. */
+  /** Show a photo; null: the browser cannot decode it. */
   show(bitmap) {
     this.#bitmap?.close();
     this.#bitmap = bitmap;

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from contextlib import suppress
@@ -200,6 +201,32 @@ def test_a_truncated_progressive_jpeg_is_refused() -> None:
     decode(whole)
     with pytest.raises(UndecodableImageError):
         decode(whole[:-400])
+
+
+def test_a_jpeg_of_endless_scans_is_refused() -> None:
+    """A scan costs 20 bytes and a walk over all pixels: a small file could keep a worker busy."""
+    whole = encode(scene(), ".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+    scans = [match.start() for match in re.finditer(rb"\xff\xda", whole)]
+    last, end = whole[scans[-1] : -2], whole[-2:]
+    wanted = 64 - len(scans)
+    decode(whole[:-2] + wanted * last + end)
+    with pytest.raises(UndecodableImageError, match="more than 64 scans"):
+        decode(whole[:-2] + (wanted + 1) * last + end)
+
+
+def test_what_a_png_says_beside_its_pixels_is_not_inflated(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """Each text could be 8 MB of nothing in 8 KB; libpng, if it saw these, would complain."""
+    png = encode(scene(), ".png")
+    chunks = [
+        png_chunk(b"zTXt", b"key\0\0" + b"no deflate"),
+        png_chunk(b"iTXt", b"key\0\1\0\0\0" + b"no deflate"),
+        png_chunk(b"iCCP", b"key\0\0" + b"no deflate"),
+    ]
+    data = png[:33] + b"".join(chunks) + png[33:-12] + b"".join(2 * chunks) + png[-12:]
+    assert np.array_equal(decode(data).pixels_bgr, decode(png).pixels_bgr)
+    assert capfd.readouterr().err == ""
 
 
 def test_bytes_after_the_end_are_ignored() -> None:
