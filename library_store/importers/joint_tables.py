@@ -122,6 +122,11 @@ TABLES: tuple[JointTable, ...] = (
         "{}upperarm {}lowerarm {}hand {}upperleg {}lowerleg {}foot",
     ),
     *_with_head(
+        "Rokoko",
+        *("head", "neck", "right", "left"),
+        "{}arm {}forearm {}hand {}thigh {}shin {}foot",
+    ),
+    *_with_head(
         "Rokoko, VRM",
         *("head", "neck", "right", "left"),
         "{}upperarm {}lowerarm {}hand {}thigh {}shin {}foot",
