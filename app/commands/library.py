@@ -80,7 +80,9 @@ def build(
     cameras_per_pose: Annotated[
         int, typer.Option(min=1, help="Cameras of each sampled or recombined pose.")
     ] = 1,
-    rate: Annotated[float, typer.Option(min=0.1, help="Poses a second of a clip at most.")] = 30,
+    rate: Annotated[
+        float, typer.Option(min=0.1, help="Every n-th pose, as few as still give so many a second.")
+    ] = 30,
     radius_mm: Annotated[
         float, typer.Option(min=0, help="Of poses nearer than this one is kept.")
     ] = 30,

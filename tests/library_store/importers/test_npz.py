@@ -139,6 +139,18 @@ def test_generic_files_are_written_and_read(tmp_path: Path, poses: Float) -> Non
         assert str(held["license"]) == "free; own"
 
 
+def test_recordings_strung_together_are_not_taken_for_one(tmp_path: Path, poses: Float) -> None:
+    """The second one would be lost: a library keeps each frame of a clip once."""
+    path, frame = tmp_path / "two.npz", np.r_[np.arange(20), np.arange(20)]
+    np.savez(path, positions=poses, frame=frame)
+    with pytest.raises(MocapError, match=r"'two' has several poses under one .* clips of their"):
+        read(path)
+    np.savez(path, positions=poses, frame=frame, clip=np.repeat([0, 1], 20))
+    assert [len(clip) for clip in read(path)] == [20, 20]
+    np.savez(path, positions=np.r_[poses[:20], poses[:20]], frame=frame)
+    assert len(read(path)[0]) == 40, "the same poses twice are no doubt which is which"
+
+
 def test_a_clip_without_a_licence_does_not_get_that_of_another(
     tmp_path: Path, poses: Float
 ) -> None:
