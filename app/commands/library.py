@@ -274,7 +274,7 @@ def _print_licences(manifest: Manifest) -> None:
 
 @commands.command("verify")
 def verify(library: LibraryArgument = None) -> None:
-    """Check every file of a library against its SHA-256."""
+    """Check every file of a library against its SHA-256, and open it."""
     directory = library or build_if_missing(load_settings())
     verify_library(directory)
     output.print(f"{directory}: whole", highlight=False, markup=False, soft_wrap=True)

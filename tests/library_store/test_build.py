@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -170,6 +171,34 @@ def test_readers_keep_the_library_they_opened(tiny: Path, prior: PosePrior) -> N
     build_library(tiny, prior, replace(TINY, seed=1))
     assert_array_equal(opened.poses_mm(np.arange(300)), poses)
     assert not np.array_equal(load(tiny).poses_mm(np.arange(300)), poses)
+
+
+def test_a_library_replaced_while_it_is_opened_is_one_of_the_two(
+    tiny: Path, prior: PosePrior, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    build_library(other, prior, replace(TINY, seed=1))
+    firsts = {load(path).manifest.sha256: load(path).poses_mm(0) for path in (tiny, other)}
+    done = threading.Event()
+
+    def publish_on_and_on() -> None:
+        for _ in range(100):
+            publish.put_in_place(other, tiny)
+            time.sleep(0.02)
+        done.set()
+
+    publisher = threading.Thread(target=publish_on_and_on)
+    publisher.start()
+    opened = set()
+    try:
+        while not done.is_set():
+            for library in (load(tiny), load(tiny, verify=False)):
+                assert_array_equal(library.poses_mm(0), firsts[library.manifest.sha256])
+                opened.add(library.manifest.sha256)
+            assert verify_library(tiny).sha256 in firsts
+    finally:
+        publisher.join()
+    assert opened == firsts.keys()
 
 
 def test_two_processes_building_at_once(tmp_path: Path) -> None:
@@ -340,9 +369,21 @@ def test_a_manifest_that_contradicts_itself_is_refused(tiny: Path) -> None:
     (tiny / MANIFEST).write_text(replace(manifest, sha256="0" * 64).to_json())
     with pytest.raises(LibraryError, match=r"manifest\.json contradicts itself"):
         load(tiny)
-    (tiny / MANIFEST).write_text(replace(manifest, n_poses=299).to_json())
-    with pytest.raises(LibraryError, match=r"poses\.npy holds \(300, 14, 3\)"):
-        load(tiny)
+    too_few = replace(manifest, n_poses=299).to_json()
+    unlicensed = replace(manifest, licences=()).to_json()
+    names = ("index.hnsw", *CELL_FILES)
+    files = {name: total for name, total in manifest.files.items() if name not in names}
+    index = dict(manifest.index) | {"files": []}
+    unlisted = replace(manifest, files=files, index=index).to_json()
+    for text, problem in (
+        (too_few, r"poses\.npy holds \(300, 14, 3\)"),
+        (unlicensed, r"sources\.json names more licences than the 0"),
+        (unlisted, r"cannot be opened \('index\.cells\.npz'\)"),
+    ):
+        (tiny / MANIFEST).write_text(text)
+        for opened in (load, verify_library):
+            with pytest.raises(LibraryError, match=problem):
+                opened(tiny)
 
 
 @pytest.mark.parametrize(
