@@ -301,6 +301,21 @@ def test_what_is_no_library_is_never_replaced(prior: PosePrior, tmp_path: Path) 
     verify_library(photos)
 
 
+def test_a_mounted_volume_is_refused_before_the_build(prior: PosePrior) -> None:
+    heard: list[str] = []
+    with pytest.raises(LibraryError, match="/ is where a volume is mounted"):
+        build_library(Path("/"), prior, TINY, lambda stage, _done: heard.append(stage))
+    assert heard == []
+
+
+def test_leftovers_are_swept_whatever_the_directory_is_called(tmp_path: Path) -> None:
+    target, leftover = tmp_path / "lib[1]", tmp_path / ".lib[1].building-old"
+    leftover.mkdir()
+    with publish.replacing(target, "new") as workshop:
+        (workshop / "file").touch()
+    assert [path.name for path in tmp_path.rglob("*")] == ["lib[1]", "file"]
+
+
 def test_a_link_stays_a_link(tiny: Path, prior: PosePrior, tmp_path: Path) -> None:
     link = tmp_path / "current"
     link.symlink_to(tiny)
