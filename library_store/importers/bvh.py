@@ -169,7 +169,8 @@ def _parse_hierarchy(words: list[str]) -> list[Joint]:
             offset = np.array([float(next(tokens)) for _ in range(3)])
             joints[open_joints[-1]] = replace(joints[open_joints[-1]], offset=offset)
         elif keyword == "CHANNELS":
-            channels = tuple(next(tokens).lower() for _ in range(int(next(tokens))))
+            # A list: running out of words ends a generator with another error.
+            channels = tuple([next(tokens).lower() for _ in range(int(next(tokens)))])
             known = {f"{axis}{kind}" for axis in "xyz" for kind in ("position", "rotation")}
             if not known.issuperset(channels):
                 raise ValueError(f"unknown channels {channels}")

@@ -109,6 +109,7 @@ def test_forward_kinematics_by_hand(tmp_path: Path) -> None:
         ("MOTION", "\n" * 200_000, "HIERARCHY and MOTION"),
         ("Zrotation Xrotation Y", "Zrotation Xrotation Q", "unknown channels"),
         ("OFFSET 1 0 0", "OFFSET 1 0", "not a whole BVH"),
+        ("CHANNELS 3", "CHANNELS 33333333333", "braces do not match"),
         ("0.04", "-0.04", "frame time"),
         ("0.04", "inf", "frame time"),
         ("0.04", "0,04", "float: '0,04'"),
