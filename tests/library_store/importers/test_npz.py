@@ -191,6 +191,7 @@ def test_generic_files_in_another_joint_order(tmp_path: Path, poses: Float) -> N
         ({"positions": np.zeros((4, 13, 3))}, "wanted is"),
         ({"positions": np.zeros((0, 14, 3))}, "wanted is"),
         ({"positions": np.array(["a"])}, "numbers"),
+        ({"positions": np.array(7)}, r"are \(\)"),
         ({"positions": np.ones((4, 14, 3)), "clip": np.zeros(3, int)}, "clip must be 4"),
         ({"positions": np.ones((4, 14, 3)), "frame": np.arange(4) - 1}, "no frame numbers"),
         ({"positions": np.ones((4, 14, 3)), "frame": np.arange(4) + 2**31}, "no frame numbers"),
