@@ -74,6 +74,13 @@ def test_subjects_recorded_at_60_hz(clip_file: Path) -> None:
     assert clip.findings == ("frame rate 60 Hz from the list of CMU subjects",)
 
 
+@pytest.mark.parametrize("stem", ["20240115_01", "145_01", "00_01", "02_001", "2_1", "02_01_b"])
+def test_files_that_others_number_are_not_cmus(clip_file: Path, stem: str) -> None:
+    (clip,) = read(clip_file.rename(clip_file.with_name(f"{stem}.amc")))
+    assert (clip.subject, clip.licence) == ("", "")
+    assert "its name is not CMU's: 120 Hz assumed" in " ".join(clip.findings)
+
+
 def test_the_index_names_the_action(clip_file: Path) -> None:
     header = '"Subject","Trial #","Motion Description","framerate"\n'
     (clip_file.parent / "cmu_index.csv").write_text(header + '2,1,"walk, then stop",60,343\n')
