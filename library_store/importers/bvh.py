@@ -125,8 +125,6 @@ def parse(path: Path) -> BvhFile:
         raise MocapError(
             path, f"{n_frames} frames of {width} channels expected, {values.size} values found"
         )
-    if not np.isfinite(values).all():
-        raise MocapError(path, "has values that are not finite")
     if not 0.0 <= frame_time_s < math.inf:
         raise MocapError(path, f"a frame time of {frame_time_s:g} s is none")
     return _without_idle_places(

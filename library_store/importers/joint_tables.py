@@ -2,8 +2,9 @@
 
 A target is the name of a BVH joint, or ``<name>.end`` for its end site. Names are compared without
 regard to case and without what exporters put before them: a namespace (``mixamorig:Hips`` is
-``Hips``), ``mixamorig_``, ``Bip01``, Rigify's ``DEF-``, Character Creator's ``CC_Base_``; blanks
-and dots count as underscores. The first table of which the file has every joint is taken.
+``Hips``), ``mixamorig_``, HumanIK's ``Character1_``, ``Bip01``, Rigify's ``DEF-``, Character
+Creator's ``CC_Base_``; blanks and dots count as underscores. The first table of which the file has
+every joint is taken.
 
 **A mapping file** is a user's own table, for BVH joints or C3D markers of other names: a JSON
 object, or a TOML file, from each of the fourteen lsp14 joints to a name, or to a list of names
@@ -158,7 +159,7 @@ TABLES: tuple[JointTable, ...] = (
     ),
 )
 
-_PREFIX = re.compile(r"^(?:mixamorig\d*_|bip\d*_|def-|org-|cc_base_)")
+_PREFIX = re.compile(r"^(?:mixamorig\d*_|character\d*_|bip\d*_|def-|org-|cc_base_)")
 
 
 def plain(name: str) -> str:

@@ -152,6 +152,17 @@ def test_a_skeleton_without_a_length_is_refused(clip_file: Path, length: str) ->
         read(clip_file)
 
 
+def test_a_frame_with_a_number_that_is_none_is_dropped(clip_file: Path) -> None:
+    (truth,) = read(clip_file)
+    lines = clip_file.read_text().splitlines()
+    at = lines.index("4") + 1
+    lines[at] = lines[at].replace(lines[at].split()[1], "nan")
+    clip_file.write_text("\n".join(lines))
+    (clip,) = read(clip_file)
+    assert clip.frames.tolist() == [frame for frame in range(1, 13) if frame != 4]
+    assert_allclose(clip.positions_mm, truth.positions_mm[truth.frames != 4])
+
+
 def test_a_cut_clip_is_refused(clip_file: Path) -> None:
     lines = clip_file.read_text().splitlines()
     clip_file.write_text("\n".join(lines[:-3]))

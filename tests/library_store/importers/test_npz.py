@@ -231,6 +231,19 @@ def test_damaged_files_are_refused(tmp_path: Path, poses: Float) -> None:
         read(path)
 
 
+def test_a_gap_in_smpl_joints_costs_its_frames_only(tmp_path: Path, poses: Float) -> None:
+    joints = spread(poses, SMPL, 24)
+    np.savez(tmp_path / "whole.npz", joints=joints)
+    joints[3] = np.nan
+    np.savez(tmp_path / "gap.npz", joints=joints)
+    (whole,), (gap,) = read(tmp_path / "whole.npz"), read(tmp_path / "gap.npz")
+    assert gap.frames.tolist() == [frame for frame in range(len(poses)) if frame != 3]
+    assert_allclose(gap.positions_mm, whole.positions_mm[gap.frames], atol=0.1)
+    np.savez(tmp_path / "none.npz", joints=joints * np.nan)
+    with pytest.raises(MocapError, match="has no frame with all 14 joints"):
+        read(tmp_path / "none.npz")
+
+
 def test_smpl_joints(tmp_path: Path, poses: Float) -> None:
     joints = spread(poses, SMPL, 24)
     neck, top = joints[:, SMPL[NECK]], joints[:, SMPL[HEAD_TOP]]
