@@ -123,7 +123,11 @@ def find_skeleton(path: Path) -> Path:
 
     ``10.asf`` is that of ``10_01.amc``, not of ``105_01.amc``, which may lie beside it.
     """
-    here = sorted(p for p in path.parent.iterdir() if p.suffix.lower() == ".asf")
+    here = sorted(
+        p
+        for p in path.parent.iterdir()
+        if p.suffix.lower() == ".asf" and not p.name.startswith("._")  # macOS' own
+    )
     named = [p for p in here if re.match(rf"{re.escape(p.stem)}(?![A-Za-z0-9])", path.stem)]
     if len(named) != 1 and len(here) != 1:
         found = ", ".join(p.name for p in here) or "none"
