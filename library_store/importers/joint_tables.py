@@ -153,6 +153,11 @@ TABLES: tuple[JointTable, ...] = (
         "{}_shoulder {}_elbow {}_wrist {}_hip {}_knee {}_ankle",
     ),
     *_with_head(
+        "SMPL-X",
+        *("head", "neck", "right", "left"),
+        "{}_shoulder {}_elbow {}_wrist {}_hip {}_knee {}_ankle",
+    ),
+    *_with_head(
         "Poser, Daz",
         *("head", "neck", "r", "l"),
         "{}shldr {}forearm {}hand {}thigh {}shin {}foot",

@@ -300,6 +300,7 @@ def test_a_bad_mapping_file_is_named(tmp_path: Path, content: str, problem: str)
 LIMBS = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
 BLENDER = ("upper_arm", "forearm", "hand", "thigh", "shin", "foot")
 ROKOKO = ("Arm", "ForeArm", "Hand", "Thigh", "Shin", "Foot")
+SMPL_X = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 BIPED = ("UpperArm", "Forearm", "Hand", "Thigh", "Calf", "Foot")
 
 
@@ -321,6 +322,7 @@ def renamed(pattern: str, limbs: tuple[str, ...], sides: tuple[str, str]) -> str
         ("MotionBuilder", "Ann|{side}{limb}", LIMBS, ("Right", "Left")),
         ("MotionBuilder", "Character1_{side}{limb}", LIMBS, ("Right", "Left")),
         ("Rokoko", "{side}{limb}", ROKOKO, ("Right", "Left")),
+        ("SMPL-X", "{side}_{limb}", SMPL_X, ("right", "left")),
         ("Blender", "{limb}.{side}", BLENDER, ("R", "L")),
         ("Blender", "DEF-{limb}_{side}", BLENDER, ("R", "L")),
         ("Character Studio biped", "Bip01 {side} {limb}", BIPED, ("R", "L")),
