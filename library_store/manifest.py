@@ -176,7 +176,7 @@ def steadily(directory: Path, work: Callable[[Manifest], T]) -> T:
 def is_replaced(directory: Path, manifest: Manifest) -> bool:
     """Whether another library than that of ``manifest`` is in ``directory`` now."""
     try:
-        return read_manifest(directory) != manifest
+        return read_manifest(directory).to_json() != manifest.to_json()  # NaN is not itself
     except LibraryError:
         return False
 

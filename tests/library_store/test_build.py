@@ -421,6 +421,12 @@ def test_a_manifest_whose_index_is_another_is_refused(
             opened(tiny)
 
 
+def test_a_manifest_with_a_number_that_is_none_is_that_of_one_library(tiny: Path) -> None:
+    text = (tiny / MANIFEST).read_text()
+    (tiny / MANIFEST).write_text(text.replace('"seed": 0', '"seed": NaN'))
+    assert np.isnan(verify_library(tiny).build["seed"])
+
+
 def test_no_library_at_all(tmp_path: Path) -> None:
     with pytest.raises(LibraryError, match=r"no pose library in .*posematch library build"):
         load(tmp_path / "nowhere")
