@@ -23,7 +23,16 @@ from library_store.assemble import write_descriptors, write_index, write_manifes
 from library_store.backends import IndexSettings
 from library_store.cameras import COLUMNS, DISTANCE_RANGE_MM
 from library_store.errors import LibraryError
-from library_store.manifest import FORMAT, Licence, Manifest, check_files, file_sum, read_manifest
+from library_store.library import load
+from library_store.manifest import (
+    FORMAT,
+    Licence,
+    Manifest,
+    check_files,
+    file_sum,
+    read_manifest,
+    steadily,
+)
 from library_store.mocap import MocapSettings, gather
 from library_store.prior import DEFAULT_PRIOR, PosePrior
 from library_store.publish import landing, locked, replacing
@@ -165,16 +174,26 @@ def build_library(
 
 def describe_library(directory: Path) -> Manifest:
     """What the library in ``directory`` is; presence and sizes of its files are checked."""
-    manifest = read_manifest(directory)
-    check_files(directory, manifest, sums=False)
-    return manifest
+
+    def check(manifest: Manifest) -> Manifest:
+        check_files(directory, manifest, sums=False)
+        return manifest
+
+    return steadily(directory, check)
 
 
 def verify_library(directory: Path) -> Manifest:
-    """Check every file of the library against its SHA-256; ``LibraryError`` names the first bad."""
-    manifest = read_manifest(directory)
-    check_files(directory, manifest, sums=True)
-    return manifest
+    """Check every file of the library against its SHA-256, and that they are a library that opens.
+
+    ``LibraryError`` names the first that is bad.
+    """
+
+    def check(manifest: Manifest) -> Manifest:
+        check_files(directory, manifest, sums=True)
+        load(directory, verify=False).close()
+        return manifest
+
+    return steadily(directory, check)
 
 
 def _is_whole(directory: Path) -> bool:

@@ -25,7 +25,7 @@ from library_store.backends import (
 )
 from library_store.descriptor import describe
 from library_store.errors import LibraryError
-from library_store.manifest import MEND, Licence, Manifest, check_files, read_manifest
+from library_store.manifest import MEND, Licence, Manifest, check_files, steadily
 from library_store.milvus import MilvusSettings
 from library_store.sources import (
     FRAMES_FILE,
@@ -108,6 +108,13 @@ class Library:
                     f"{self.directory / name} holds {array.shape} instead of {shape}; "
                     + MEND.format(directory=self.directory)
                 )
+        licensed = [it.licences for it in self.sources.groups]
+        licensed += [it.licences for it in self.sources.clips]
+        if max((number for it in licensed for number in it), default=-1) >= len(counts.licences):
+            raise LibraryError(
+                f"{self.directory / SOURCES_FILE} names more licences than the "
+                f"{len(counts.licences)} of the manifest; " + MEND.format(directory=self.directory)
+            )
 
     def __len__(self) -> int:
         return len(self._projections)
@@ -230,15 +237,19 @@ def load(
 
     ``verify`` checks the SHA-256 of every file that is needed (a quarter of a second for 200,000
     exemplars); presence, size and shape are always checked. ``backend`` chooses the index
-    (:mod:`library_store.backends`), ``milvus`` says where that one is. Raises ``LibraryError``,
-    naming the file and the way to mend it.
+    (:mod:`library_store.backends`), ``milvus`` says where that one is. A library that a build
+    replaces meanwhile is the old one or the new one. Raises ``LibraryError``, naming the file and
+    the way to mend it.
     """
-    manifest = read_manifest(directory)
-    backend = resolve(backend, manifest)
-    check_files(directory, manifest, sums=verify, names=needed_files(backend))
-    try:
-        return Library(directory, manifest, backend, milvus)
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise LibraryError(
-            f"{directory} cannot be opened ({error}); " + MEND.format(directory=directory)
-        ) from error
+
+    def open_it(manifest: Manifest) -> Library:
+        chosen = resolve(backend, manifest)
+        try:
+            check_files(directory, manifest, sums=verify, names=needed_files(chosen))
+            return Library(directory, manifest, chosen, milvus)
+        except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
+            raise LibraryError(
+                f"{directory} cannot be opened ({error}); " + MEND.format(directory=directory)
+            ) from error
+
+    return steadily(directory, open_it)

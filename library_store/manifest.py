@@ -18,13 +18,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from library_store.errors import LibraryError
+
+T = TypeVar("T")
 
 FORMAT = 4
 MANIFEST = "manifest.json"
@@ -151,6 +153,32 @@ def read_manifest(directory: Path) -> Manifest:
             f"{path} contradicts itself: its sha256 or its index is not that of its files; {mend}"
         )
     return manifest
+
+
+def steadily(directory: Path, work: Callable[[Manifest], T]) -> T:
+    """What ``work`` makes of the library in ``directory``, told its manifest.
+
+    Done again where a build has put another library there meanwhile, so that the files of two are
+    never taken for one, nor for a corrupt one.
+    """
+    while True:
+        manifest = read_manifest(directory)
+        try:
+            result = work(manifest)
+        except LibraryError:
+            if is_replaced(directory, manifest):
+                continue
+            raise
+        if not is_replaced(directory, manifest):
+            return result
+
+
+def is_replaced(directory: Path, manifest: Manifest) -> bool:
+    """Whether another library than that of ``manifest`` is in ``directory`` now."""
+    try:
+        return read_manifest(directory).to_json() != manifest.to_json()  # NaN is not itself
+    except LibraryError:
+        return False
 
 
 def check_files(

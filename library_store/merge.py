@@ -26,10 +26,11 @@ from library_store.assemble import (
     write_manifest,
 )
 from library_store.backends import DESCRIPTORS_FILE, IndexSettings
+from library_store.build import verify_library
 from library_store.cameras import COLUMNS
 from library_store.descriptor import DIMENSIONS
 from library_store.errors import LibraryError
-from library_store.manifest import FORMAT, Licence, Manifest, check_files, read_manifest
+from library_store.manifest import FORMAT, Licence, Manifest, is_replaced
 from library_store.publish import landing, locked, replacing
 from library_store.sources import (
     FRAMES_FILE,
@@ -81,8 +82,7 @@ def merge_libraries(
     settings = index or IndexSettings()
     manifests = []
     for number, part in enumerate(parts):
-        manifests.append(read_manifest(part))
-        check_files(part, manifests[-1], sums=True)
+        manifests.append(verify_library(part))
         report("checking", (number + 1) / len(parts))
     of = [{"name": m.name, "version": m.version, "sha256": m.sha256} for m in manifests]
     if len({m.sha256 for m in manifests}) < len(manifests) or len(parts) < 2:
@@ -140,6 +140,9 @@ def _join_tables(
                             rows[..., 0] += clips_before[number]
                         writer.append(rows)
             report("joining", (done + 1) / len(_TABLES))
+        for part, manifest in zip(parts, manifests, strict=True):
+            if is_replaced(part, manifest):
+                raise LibraryError(f"{part} was built anew while it was merged; merge again")
         return {
             "n_poses": int(poses_before[-1]),
             "n_cameras": int(cameras_before[-1]),

@@ -18,7 +18,7 @@ import numpy as np
 
 from library_store.descriptor import DIMENSIONS
 from library_store.errors import LibraryError
-from library_store.manifest import check_files, read_manifest
+from library_store.manifest import Manifest, check_files, steadily
 from library_store.milvus import (
     CONSISTENCY,
     INDEX,
@@ -63,10 +63,13 @@ def push_library(
     the library is not whole, or when the count is wrong at the end.
     """
     report = progress or (lambda _stage, _fraction: None)
-    manifest = read_manifest(directory)
-    check_files(directory, manifest, sums=True)
-    table = open_table(directory / "descriptors.npy").astype(np.float32, copy=False)
-    collection = collection_name(manifest)
+
+    def open_it(manifest: Manifest) -> tuple[str, Descriptors]:
+        check_files(directory, manifest, sums=True)
+        table = open_table(directory / "descriptors.npy").astype(np.float32, copy=False)
+        return collection_name(manifest), table
+
+    collection, table = steadily(directory, open_it)
     report("waiting for Milvus", 0.0)
     try:
         with closing(patiently(connect, settings)) as client:

@@ -31,7 +31,7 @@ _POSES, _PLACES, _CLIPS, _KEPT = "clean.poses", "clean.places.npy", "clean.json"
 class MocapSettings:
     """How captured poses become exemplars.
 
-    rate_hz: poses a second that are taken from a clip at most.
+    rate_hz: of a clip every n-th pose is taken, as few as still give so many a second.
     radius_mm: of poses nearer than this (RMS over the joints), one is kept.
     mirror: add every pose's mirror image.
     recombined: share of the exemplars from mocap that are recombined.

@@ -29,9 +29,15 @@ _RENAME_EXCHANGE = 2
 def landing(directory: Path) -> Path:
     """Where a library built at ``directory`` goes: links followed, so that a link stays one.
 
-    Raises ``LibraryError`` where something is that is not a library and would be lost.
+    Raises ``LibraryError`` where something is that is not a library and would be lost, or that
+    nothing can take the place of.
     """
     target = directory.resolve()
+    if target.is_mount():  # said before the build, not after
+        raise LibraryError(
+            f"{directory} is where a volume is mounted, which a library cannot take the place of: "
+            "build into a directory on it"
+        )
     if target.is_dir():
         strangers = sorted(path.name for path in target.iterdir() if not _is_ours(path))
         if not strangers:
@@ -79,8 +85,8 @@ def replacing(target: Path, key: str) -> Iterator[Path]:
     """
     prefix = f".{target.name}.building-"
     workshop = target.parent / f"{prefix}{key}"
-    for leftover in target.parent.glob(f"{prefix}*"):
-        if leftover != workshop:
+    for leftover in target.parent.iterdir():
+        if leftover.name.startswith(prefix) and leftover != workshop:
             shutil.rmtree(leftover, ignore_errors=True)
     workshop.mkdir(exist_ok=True)
     try:

@@ -179,7 +179,10 @@ class Composed:
                     bone_sd=settings.bone_sd,
                 )
             except ValueError as error:
-                raise LibraryError(f"these poses cannot be recombined: {error}") from error
+                raise LibraryError(
+                    f"these {len(kept)} poses cannot be recombined: {error}. Build from more and "
+                    "other poses, or with --recombined 0"
+                ) from error
             n = rows.stop - rows.start
             parts = np.concatenate([places[drawn.rows], drawn.mirrored[..., None]], axis=-1)
             yield Chunk(drawn.poses[:n], _numbers(rows), parts[:n].astype(np.int32))

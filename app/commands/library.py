@@ -26,7 +26,7 @@ from library_store.build import (
 )
 from library_store.importers import Clip, find_files, read_each, states_licence, write_npz
 from library_store.library import load
-from library_store.manifest import Manifest
+from library_store.manifest import MANIFEST, Manifest
 from library_store.merge import merge_libraries
 from library_store.milvus_push import push_library
 from library_store.mocap import MocapSettings
@@ -80,7 +80,9 @@ def build(
     cameras_per_pose: Annotated[
         int, typer.Option(min=1, help="Cameras of each sampled or recombined pose.")
     ] = 1,
-    rate: Annotated[float, typer.Option(min=0.1, help="Poses a second of a clip at most.")] = 30,
+    rate: Annotated[
+        float, typer.Option(min=0.1, help="Every n-th pose, as few as still give so many a second.")
+    ] = 30,
     radius_mm: Annotated[
         float, typer.Option(min=0, help="Of poses nearer than this one is kept.")
     ] = 30,
@@ -110,9 +112,16 @@ def build(
     """
     settings = load_settings()
     directory = directory or settings.library_dir
+    sources = [context.get_parameter_source(name) for name in context.params]
+    asked = any(source is not None and source.name == "COMMANDLINE" for source in sources)
+    if directory is not None and not asked and (directory / MANIFEST).exists():
+        raise typer.BadParameter(
+            f"POSEMATCH_LIBRARY_DIR, {directory}, holds a library, which poses of the default "
+            "prior would replace: name it if that is wanted",
+            param_hint="--directory",
+        )
     if directory is None:
-        sources = [context.get_parameter_source(name) for name in context.params]
-        if any(source is not None and source.name == "COMMANDLINE" for source in sources):
+        if asked:
             raise typer.BadParameter("a library of your own needs --directory")
         directory = build_if_missing(settings)
         output.print(str(directory), highlight=False, soft_wrap=True)
@@ -272,7 +281,7 @@ def _print_licences(manifest: Manifest) -> None:
 
 @commands.command("verify")
 def verify(library: LibraryArgument = None) -> None:
-    """Check every file of a library against its SHA-256."""
+    """Check every file of a library against its SHA-256, and open it."""
     directory = library or build_if_missing(load_settings())
     verify_library(directory)
     output.print(f"{directory}: whole", highlight=False, markup=False, soft_wrap=True)

@@ -60,6 +60,9 @@ SUBJECTS_60_HZ = frozenset((33, 34, 42, 60, 61, 62, 74, 75, 77, 79, 80, 87, 88, 
 INDEX_FILE = "cmu_index.csv"
 """Looked for beside the clip and in the three folders above: actions and frame rates by clip."""
 
+_CMU_NAME = re.compile(r"(?P<subject>[0-9]{2,3})_(?P<number>[0-9]{2})(?:-.*)?")
+_CMU_SUBJECTS = 144
+
 _DEGREES_PER = {"deg": 1.0, "degrees": 1.0, "rad": math.degrees(1.0), "radians": math.degrees(1.0)}
 _NO_BONE = "root"
 _ROOT_ORDER = ("tx", "ty", "tz", "rx", "ry", "rz")
@@ -120,7 +123,11 @@ def find_skeleton(path: Path) -> Path:
 
     ``10.asf`` is that of ``10_01.amc``, not of ``105_01.amc``, which may lie beside it.
     """
-    here = sorted(p for p in path.parent.iterdir() if p.suffix.lower() == ".asf")
+    here = sorted(
+        p
+        for p in path.parent.iterdir()
+        if p.suffix.lower() == ".asf" and not p.name.startswith("._")  # macOS' own
+    )
     named = [p for p in here if re.match(rf"{re.escape(p.stem)}(?![A-Za-z0-9])", path.stem)]
     if len(named) != 1 and len(here) != 1:
         found = ", ".join(p.name for p in here) or "none"
@@ -129,16 +136,17 @@ def find_skeleton(path: Path) -> Path:
 
 
 def describe_cmu(path: Path) -> tuple[str, str, float, tuple[str, ...]]:
-    """Subject, action, frame rate and findings of a clip named as CMU's are, ``<subject>_<n>``.
+    """Subject, action, frame rate and findings of a clip named as CMU's are: ``02_01``, ``143_42``.
 
     Neither AMC files nor CMU's conversions to BVH can be trusted on the rate, so it comes from the
     index file if there is one, else from the list of subjects at 60 Hz.
     """
-    subject, _, rest = path.stem.partition("_")
-    number = rest.split("-")[0]
-    if not (subject.isdigit() and number.isdigit()):
+    named = _CMU_NAME.fullmatch(path.stem)
+    # Others name files by numbers too, such as dates: those are not CMU's to be free for all uses.
+    if named is None or not 1 <= int(named["subject"]) <= _CMU_SUBJECTS:
         finding = "the file does not say its frame rate and its name is not CMU's: 120 Hz assumed"
         return "", "", 120.0, (finding,)
+    subject, number = named["subject"], named["number"]
     for folder in list(path.resolve().parents)[:4]:
         row = _index_row(folder / INDEX_FILE, int(subject), int(number))
         if row is not None:
@@ -277,8 +285,6 @@ def read_amc(path: Path, asf: SkeletonFile) -> tuple[Frames, dict[str, Float]]:
     motion = {name: degrees * np.array(rows, dtype=np.float64) for name, rows in values.items()}
     places = [i for i, name in enumerate(asf.root_order) if name.startswith("t")]
     motion[_NO_BONE][:, places] /= degrees
-    if not all(math.isfinite(float(rows.sum())) for rows in motion.values()):
-        raise MocapError(path, "has values that are not finite")
     return np.array(frames, dtype=np.int64), motion
 
 

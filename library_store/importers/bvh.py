@@ -1,7 +1,8 @@
 """BVH: a hierarchy of joints with offsets, and per frame the channels that move them.
 
 A joint's rotation is the product of its rotation channels in the order listed, relative to its
-parent, and turns the offsets of its children; position channels replace the joint's own offset.
+parent, and turns the offsets of its children; position channels replace the joint's own offset,
+except where all they ever say is zero: programs that add them to the offset write that.
 Offsets have no stated unit. CMU's two conversions are known (``joint_tables``): their unit, the
 thorax and wrist bones they lost, and the T-pose that one of them puts before the first frame.
 Root-centred joints then agree with ASF/AMC of the same clip within 7 mm (0.3 to 4 mm on the mean,
@@ -53,7 +54,10 @@ class Joint:
 
 @dataclass(frozen=True)
 class BvhFile:
-    """A parsed file: joints, parents before children, and ``motion`` (F, all channels)."""
+    """A parsed file: joints, parents before children, and ``motion`` (F, all channels).
+
+    ``frame_time_s`` is 0 where the file has none, as single poses do.
+    """
 
     joints: tuple[Joint, ...]
     motion: Float
@@ -75,17 +79,18 @@ def read(path: Path, *, mapping: Path | None = None) -> Clip:
         table = _table_for(path, bvh)
         positions, findings = _by_table(bvh, table)
     frames = np.arange(len(positions), dtype=np.int64)
-    rate = 1.0 / bvh.frame_time_s
+    rate = 1.0 / bvh.frame_time_s if bvh.frame_time_s else math.nan
     subject = action = ""
     if table.is_cmu:
         subject, action, known_rate, notes = describe_cmu(path)
         if subject:
             findings += notes
-        if subject and abs(known_rate - rate) > 1.0:
-            findings.append(
-                f"the file says {rate:.0f} Hz, CMU's index {known_rate:.0f}: the latter"
-            )
+        if subject and not abs(known_rate - rate) <= 1.0:
+            said = "no rate" if math.isnan(rate) else f"{rate:.0f} Hz"
+            findings.append(f"the file says {said}, CMU's index {known_rate:.0f}: the latter")
             rate = known_rate
+    if math.isnan(rate):
+        findings.append("a frame time of 0: the frame rate is not known")
     clip = Clip(
         name=path.stem,
         subject=subject,
@@ -120,9 +125,11 @@ def parse(path: Path) -> BvhFile:
         raise MocapError(
             path, f"{n_frames} frames of {width} channels expected, {values.size} values found"
         )
-    if not (np.isfinite(values).all() and math.isfinite(frame_time_s) and frame_time_s > 0.0):
-        raise MocapError(path, "has values that are not finite, or no frame time")
-    return BvhFile(tuple(joints), values.reshape(n_frames, width), frame_time_s)
+    if not 0.0 <= frame_time_s < math.inf:
+        raise MocapError(path, f"a frame time of {frame_time_s:g} s is none")
+    return _without_idle_places(
+        BvhFile(tuple(joints), values.reshape(n_frames, width), frame_time_s)
+    )
 
 
 def _text(path: Path) -> str:
@@ -160,7 +167,8 @@ def _parse_hierarchy(words: list[str]) -> list[Joint]:
             offset = np.array([float(next(tokens)) for _ in range(3)])
             joints[open_joints[-1]] = replace(joints[open_joints[-1]], offset=offset)
         elif keyword == "CHANNELS":
-            channels = tuple(next(tokens).lower() for _ in range(int(next(tokens))))
+            # A list: running out of words ends a generator with another error.
+            channels = tuple([next(tokens).lower() for _ in range(int(next(tokens)))])
             known = {f"{axis}{kind}" for axis in "xyz" for kind in ("position", "rotation")}
             if not known.issuperset(channels):
                 raise ValueError(f"unknown channels {channels}")
@@ -172,6 +180,24 @@ def _parse_hierarchy(words: list[str]) -> list[Joint]:
     if open_joints or not joints:
         raise ValueError("the hierarchy does not end")
     return joints
+
+
+def _without_idle_places(bvh: BvhFile) -> BvhFile:
+    """The file without position channels, below the root, that are zero in every frame."""
+    joints: list[Joint] = []
+    kept: list[int] = []
+    column = 0
+    for joint in bvh.joints:
+        columns = range(column, column + len(joint.channels))
+        column += len(joint.channels)
+        named = list(zip(joint.channels, columns, strict=True))
+        turns = [(channel, at) for channel, at in named if channel.endswith("rotation")]
+        places = [at for channel, at in named if channel.endswith("position")]
+        if joint.parent >= 0 and not bvh.motion[:, places].any():
+            named = turns
+        joints.append(replace(joint, channels=tuple(channel for channel, _ in named)))
+        kept += [at for _, at in named]
+    return replace(bvh, joints=tuple(joints), motion=bvh.motion[:, kept])
 
 
 def world_positions(bvh: BvhFile) -> Float:
@@ -232,7 +258,10 @@ def _by_table(bvh: BvhFile, table: JointTable) -> tuple[Float, list[str]]:
 
 
 def _table_for(path: Path, bvh: BvhFile) -> JointTable:
-    names = frozenset(plain(joint.name) for joint in bvh.joints)
+    named = [(plain(joint.name), joint) for joint in bvh.joints]
+    names = frozenset(name for name, _ in named)
+    # An end site of no length, as MotionBuilder writes them, ends no bone: not a head's either.
+    names -= {name for name, joint in named if name.endswith(".end") and _is_zero(joint)}
     found = find_table(names, coinciding=_coinciding(bvh))
     if found is None:
         listed = ", ".join(joint.name for joint in bvh.joints)
@@ -245,13 +274,14 @@ def _table_for(path: Path, bvh: BvhFile) -> JointTable:
 
 
 def _coinciding(bvh: BvhFile) -> frozenset[str]:
-    """Joints below the root with children that lie where they do."""
-    parents = {j.parent for j in bvh.joints if j.parent > 0 and _is_zero(j)}
-    return frozenset(plain(bvh.joints[i].name) for i in parents)
+    """Joints with an offset, below the root, with children that lie where they do."""
+    parents = [bvh.joints[j.parent] for j in bvh.joints if j.parent > 0 and _is_zero(j)]
+    return frozenset(plain(parent.name) for parent in parents if parent.offset.any())
 
 
 def _is_zero(joint: Joint) -> bool:
-    return bool(np.abs(joint.offset).max() < _ZERO)
+    moves = any(channel.endswith("position") for channel in joint.channels)
+    return not moves and bool(np.abs(joint.offset).max() < _ZERO)
 
 
 def restore_thorax(bvh: BvhFile, table: JointTable) -> tuple[BvhFile, list[str]]:

@@ -5,6 +5,8 @@ in ``Clip.findings``; poses that no known mistake explains raise ``MocapError``.
 
 *a frame rate that is none*, zero or less, is taken as not known;
 *frames with numbers that are not finite* are dropped;
+*several poses under one frame's number*, as of recordings strung together, are refused: a library
+would keep the first alone;
 *a T-pose as the first frame*, with straight arms and a jump to the second, is dropped;
 *units*: trunk + thigh + shank of a standing adult is 1.37 m; a clip that is off by the ratio of
 metres, centimetres, inches, feet or CMU's units is scaled, one that fits none is refused;
@@ -103,6 +105,12 @@ def checked(
         never = f"; never there: {', '.join(names)}" if names else ""
         raise MocapError(path, f"clip {clip.name!r} has no frame with all 14 joints{never}")
     positions, frames = positions[keep], clip.frames[keep]
+    if _frames_contradict(frames, positions):
+        raise MocapError(
+            path,
+            f"clip {clip.name!r} has several poses under one frame's number: recordings strung "
+            "together must be clips of their own",
+        )
     if starts_with_t_pose(positions):
         findings.append("the first frame is a T-pose: dropped")
         positions, frames = positions[1:], frames[1:]
@@ -150,6 +158,12 @@ def checked_or_error(
         return checked(path, clip, up_is_known=up_is_known, bones_are_known=bones_are_known)
     except MocapError as error:
         return error
+
+
+def _frames_contradict(frames: Frames, positions: Float) -> bool:
+    """Whether a frame's number comes up again with another pose."""
+    _, first, again = np.unique(frames, return_index=True, return_inverse=True)
+    return len(first) < len(frames) and not np.array_equal(positions[first][again], positions)
 
 
 def starts_with_t_pose(positions: Float) -> bool:

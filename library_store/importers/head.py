@@ -19,7 +19,8 @@ def put_head_top(positions: Float) -> tuple[Float, float]:
     """
     neck = positions[:, NECK]
     trunk = np.linalg.norm(neck - root_of(positions), axis=-1)
-    reach = HEAD_PER_TRUNK * float(np.median(trunk))
+    seen = trunk[np.isfinite(trunk)]  # frames with missing joints are dropped later, not all
+    reach = HEAD_PER_TRUNK * float(np.median(seen)) if len(seen) else np.nan
     raised = positions.copy()
     raised[:, HEAD_TOP] = neck + reach * unit(positions[:, HEAD_TOP] - neck)
     return raised, reach

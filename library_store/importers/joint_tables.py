@@ -2,8 +2,9 @@
 
 A target is the name of a BVH joint, or ``<name>.end`` for its end site. Names are compared without
 regard to case and without what exporters put before them: a namespace (``mixamorig:Hips`` is
-``Hips``), ``mixamorig_``, ``Bip01``, Rigify's ``DEF-``, Character Creator's ``CC_Base_``; blanks
-and dots count as underscores. The first table of which the file has every joint is taken.
+``Hips``), ``mixamorig_``, HumanIK's ``Character1_``, ``Bip01``, Rigify's ``DEF-``, Character
+Creator's ``CC_Base_``; blanks and dots count as underscores. The first table of which the file has
+every joint is taken.
 
 **A mapping file** is a user's own table, for BVH joints or C3D markers of other names: a JSON
 object, or a TOML file, from each of the fourteen lsp14 joints to a name, or to a list of names
@@ -122,6 +123,11 @@ TABLES: tuple[JointTable, ...] = (
         "{}upperarm {}lowerarm {}hand {}upperleg {}lowerleg {}foot",
     ),
     *_with_head(
+        "Rokoko",
+        *("head", "neck", "right", "left"),
+        "{}arm {}forearm {}hand {}thigh {}shin {}foot",
+    ),
+    *_with_head(
         "Rokoko, VRM",
         *("head", "neck", "right", "left"),
         "{}upperarm {}lowerarm {}hand {}thigh {}shin {}foot",
@@ -147,13 +153,18 @@ TABLES: tuple[JointTable, ...] = (
         "{}_shoulder {}_elbow {}_wrist {}_hip {}_knee {}_ankle",
     ),
     *_with_head(
+        "SMPL-X",
+        *("head", "neck", "right", "left"),
+        "{}_shoulder {}_elbow {}_wrist {}_hip {}_knee {}_ankle",
+    ),
+    *_with_head(
         "Poser, Daz",
         *("head", "neck", "r", "l"),
         "{}shldr {}forearm {}hand {}thigh {}shin {}foot",
     ),
 )
 
-_PREFIX = re.compile(r"^(?:mixamorig\d*_|bip\d*_|def-|org-|cc_base_)")
+_PREFIX = re.compile(r"^(?:mixamorig\d*_|character\d*_|bip\d*_|def-|org-|cc_base_)")
 
 
 def plain(name: str) -> str:

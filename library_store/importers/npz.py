@@ -126,7 +126,7 @@ def states_licence(path: Path) -> bool:
 
 def _read_generic(path: Path, npz: NpzFile) -> list[Clip | MocapError]:
     positions = _numbers(path, "positions", npz["positions"])
-    n = len(positions)
+    n = len(positions) if positions.ndim else 0
     if positions.shape != (n, LSP14.n_joints, 3) or n == 0:
         raise MocapError(path, f"positions are {positions.shape}; wanted is (N, 14, 3)")
     if "joint_names" in npz:

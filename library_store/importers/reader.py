@@ -58,11 +58,16 @@ def _read_file(path: Path, mapping: Path | None) -> Sequence[Clip | MocapError]:
 def find_files(paths: Iterable[Path]) -> Iterator[Path]:
     """The files given, and those below the folders given that an importer would take, in order.
 
-    Links to folders are followed, to each folder once.
+    Links to folders are followed, to each folder once. What macOS keeps beside files on foreign
+    disks and in archives (``._walk.bvh``) is no file of a folder.
     """
     for path in paths:
         if path.is_dir():
-            yield from sorted(p for p in _below(path) if p.suffix.lower() in SUFFIXES)
+            yield from sorted(
+                p
+                for p in _below(path)
+                if p.suffix.lower() in SUFFIXES and not p.name.startswith("._")
+            )
         else:
             yield path
 

@@ -279,6 +279,18 @@ def test_library_commands(library_dir: Path, tmp_path: Path) -> None:
     assert "needs --directory" in run("library", "build", "--size", 9).stderr
 
 
+def test_a_library_in_service_is_not_replaced_unasked(tmp_path: Path) -> None:
+    own = tmp_path / "own"
+    assert run("library", "build", "--directory", own, "--size", 60).returncode == 0
+    refused = run("library", "build", library_dir=own)
+    assert refused.returncode == 2
+    said = " ".join(refused.stderr.replace("│", " ").split())
+    assert "holds a library, which poses of the default prior would replace" in said
+    assert json.loads(run("library", "info", own, "--json").stdout)["n_exemplars"] == 60
+    assert run("library", "build", "--size", 70, library_dir=own).returncode == 0
+    assert json.loads(run("library", "info", own, "--json").stdout)["n_exemplars"] == 70
+
+
 def test_a_library_of_ones_own(tmp_path: Path) -> None:
     """Build, look, merge: what the documentation shows."""
     files = {name: tmp_path / f"{name}.npz" for name in "ab"}

@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -172,6 +173,36 @@ def test_readers_keep_the_library_they_opened(tiny: Path, prior: PosePrior) -> N
     assert not np.array_equal(load(tiny).poses_mm(np.arange(300)), poses)
 
 
+def test_a_library_replaced_while_it_is_opened_is_one_of_them(
+    tiny: Path, prior: PosePrior, tmp_path: Path
+) -> None:
+    build_library(tmp_path / "other", prior, replace(TINY, seed=1))
+    both = (tiny, tmp_path / "other")
+    firsts = {load(path).manifest.sha256: load(path).poses_mm(0) for path in both}
+    versions = []
+    for number in range(60):  # the same two over and over, but never the same version again
+        versions.append(shutil.copytree(both[1 - number % 2], tmp_path / f"version {number}"))
+        manifest = replace(describe_library(versions[-1]), version=str(number))
+        (versions[-1] / MANIFEST).write_text(manifest.to_json())
+    done = threading.Event()
+
+    def publish_on_and_on() -> None:
+        for version in versions:
+            publish.put_in_place(version, tiny)
+            time.sleep(0.02)
+        done.set()
+
+    publisher = threading.Thread(target=publish_on_and_on)
+    publisher.start()
+    try:
+        while not done.is_set():
+            for library in (load(tiny), load(tiny, verify=False)):
+                assert_array_equal(library.poses_mm(0), firsts[library.manifest.sha256])
+            assert verify_library(tiny).sha256 in firsts
+    finally:
+        publisher.join()
+
+
 def test_two_processes_building_at_once(tmp_path: Path) -> None:
     builders = [subprocess.Popen([sys.executable, "-c", BUILD, str(tmp_path)]) for _ in range(2)]
     assert [builder.wait() for builder in builders] == [0, 0]
@@ -272,6 +303,21 @@ def test_what_is_no_library_is_never_replaced(prior: PosePrior, tmp_path: Path) 
     verify_library(photos)
 
 
+def test_a_mounted_volume_is_refused_before_the_build(prior: PosePrior) -> None:
+    heard: list[str] = []
+    with pytest.raises(LibraryError, match="/ is where a volume is mounted"):
+        build_library(Path("/"), prior, TINY, lambda stage, _done: heard.append(stage))
+    assert heard == []
+
+
+def test_leftovers_are_swept_whatever_the_directory_is_called(tmp_path: Path) -> None:
+    target, leftover = tmp_path / "lib[1]", tmp_path / ".lib[1].building-old"
+    leftover.mkdir()
+    with publish.replacing(target, "new") as workshop:
+        (workshop / "file").touch()
+    assert [path.name for path in tmp_path.rglob("*")] == ["lib[1]", "file"]
+
+
 def test_a_link_stays_a_link(tiny: Path, prior: PosePrior, tmp_path: Path) -> None:
     link = tmp_path / "current"
     link.symlink_to(tiny)
@@ -340,9 +386,21 @@ def test_a_manifest_that_contradicts_itself_is_refused(tiny: Path) -> None:
     (tiny / MANIFEST).write_text(replace(manifest, sha256="0" * 64).to_json())
     with pytest.raises(LibraryError, match=r"manifest\.json contradicts itself"):
         load(tiny)
-    (tiny / MANIFEST).write_text(replace(manifest, n_poses=299).to_json())
-    with pytest.raises(LibraryError, match=r"poses\.npy holds \(300, 14, 3\)"):
-        load(tiny)
+    too_few = replace(manifest, n_poses=299).to_json()
+    unlicensed = replace(manifest, licences=()).to_json()
+    names = ("index.hnsw", *CELL_FILES)
+    files = {name: total for name, total in manifest.files.items() if name not in names}
+    index = dict(manifest.index) | {"files": []}
+    unlisted = replace(manifest, files=files, index=index).to_json()
+    for text, problem in (
+        (too_few, r"poses\.npy holds \(300, 14, 3\)"),
+        (unlicensed, r"sources\.json names more licences than the 0"),
+        (unlisted, r"cannot be opened \('index\.cells\.npz'\)"),
+    ):
+        (tiny / MANIFEST).write_text(text)
+        for opened in (load, verify_library):
+            with pytest.raises(LibraryError, match=problem):
+                opened(tiny)
 
 
 @pytest.mark.parametrize(
@@ -363,6 +421,12 @@ def test_a_manifest_whose_index_is_another_is_refused(
     for opened in (load, verify_library):
         with pytest.raises(LibraryError, match=r"manifest\.json (contradicts|is not a library)"):
             opened(tiny)
+
+
+def test_a_manifest_with_a_number_that_is_none_is_that_of_one_library(tiny: Path) -> None:
+    text = (tiny / MANIFEST).read_text()
+    (tiny / MANIFEST).write_text(text.replace('"seed": 0', '"seed": NaN'))
+    assert np.isnan(verify_library(tiny).build["seed"])
 
 
 def test_no_library_at_all(tmp_path: Path) -> None:

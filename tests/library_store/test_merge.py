@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.testing import assert_array_equal
 from library_store.build import BuildSettings, Mocap, build_library, verify_library
 from library_store.errors import LibraryError
 from library_store.library import Library, load
+from library_store.manifest import MANIFEST
 from library_store.merge import merge_libraries
 from library_store.mocap import MocapSettings
 from library_store.prior import PosePrior
@@ -134,6 +136,34 @@ def test_parts_that_cannot_be_merged(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_text("precious")
     with pytest.raises(LibraryError, match=r"holds a\.jpg, .* would be lost"):
         merge_libraries(tmp_path, [first, folder / "second"], name="both")
+
+
+def test_a_part_built_anew_meanwhile_is_not_merged(
+    folder: Path, prior: PosePrior, tmp_path: Path
+) -> None:
+    part = tmp_path / "part"
+    build_library(part, prior, BuildSettings(name="part", n_poses=60))
+
+    def rebuild(stage: str, done: float) -> None:
+        if (stage, done) == ("checking", 1.0):
+            build_library(part, prior, BuildSettings(name="part", n_poses=60, seed=1))
+
+    both, out = [folder / "third", part], tmp_path / "out"
+    with pytest.raises(LibraryError, match=r"part was built anew while it was merged"):
+        merge_libraries(out, both, name="out", progress=rebuild)
+    assert not out.exists()
+    merge_libraries(out, both, name="out")
+    assert_array_equal(load(out).poses_mm(100), load(part).poses_mm(0))
+
+
+def test_a_part_that_is_not_what_it_says_is_not_merged(
+    folder: Path, prior: PosePrior, tmp_path: Path
+) -> None:
+    part = tmp_path / "part"
+    manifest = build_library(part, prior, BuildSettings(name="part", n_poses=60))
+    (part / MANIFEST).write_text(replace(manifest, n_poses=59).to_json())
+    with pytest.raises(LibraryError, match=r"poses\.npy holds \(60, 14, 3\)"):
+        merge_libraries(tmp_path / "out", [part, folder / "third"], name="out")
 
 
 def test_a_contact_sheet_shows_what_is_asked_for(merged: Library) -> None:

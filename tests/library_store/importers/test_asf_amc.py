@@ -74,6 +74,13 @@ def test_subjects_recorded_at_60_hz(clip_file: Path) -> None:
     assert clip.findings == ("frame rate 60 Hz from the list of CMU subjects",)
 
 
+@pytest.mark.parametrize("stem", ["20240115_01", "145_01", "00_01", "02_001", "2_1", "02_01_b"])
+def test_files_that_others_number_are_not_cmus(clip_file: Path, stem: str) -> None:
+    (clip,) = read(clip_file.rename(clip_file.with_name(f"{stem}.amc")))
+    assert (clip.subject, clip.licence) == ("", "")
+    assert "its name is not CMU's: 120 Hz assumed" in " ".join(clip.findings)
+
+
 def test_the_index_names_the_action(clip_file: Path) -> None:
     header = '"Subject","Trial #","Motion Description","framerate"\n'
     (clip_file.parent / "cmu_index.csv").write_text(header + '2,1,"walk, then stop",60,343\n')
@@ -143,6 +150,17 @@ def test_a_skeleton_without_a_length_is_refused(clip_file: Path, length: str) ->
     asf.write_text(ASF.replace("length 0.45", f"length {length}"))
     with pytest.raises(MocapError, match=r"02\.asf: not a whole ASF"):
         read(clip_file)
+
+
+def test_a_frame_with_a_number_that_is_none_is_dropped(clip_file: Path) -> None:
+    (truth,) = read(clip_file)
+    lines = clip_file.read_text().splitlines()
+    at = lines.index("4") + 1
+    lines[at] = lines[at].replace(lines[at].split()[1], "nan")
+    clip_file.write_text("\n".join(lines))
+    (clip,) = read(clip_file)
+    assert clip.frames.tolist() == [frame for frame in range(1, 13) if frame != 4]
+    assert_allclose(clip.positions_mm, truth.positions_mm[truth.frames != 4])
 
 
 def test_a_cut_clip_is_refused(clip_file: Path) -> None:

@@ -103,13 +103,14 @@ def test_forward_kinematics_by_hand(tmp_path: Path) -> None:
     [
         ("Frames: 2", "Frames: 3", "27|18 values found"),
         ("90 0 0 90 0 0", "90 0 0 90", "values found"),
-        ("90 0 0 90 0 0", "90 0 0 nan 0 0", "not finite"),
         ("90 0 0 90 0 0", "90 0 0 x 0 0", "not a whole BVH"),
         ("MOTION", "", "HIERARCHY and MOTION"),
         ("MOTION", "\n" * 200_000, "HIERARCHY and MOTION"),
         ("Zrotation Xrotation Y", "Zrotation Xrotation Q", "unknown channels"),
         ("OFFSET 1 0 0", "OFFSET 1 0", "not a whole BVH"),
-        ("0.04", "0", "frame time"),
+        ("CHANNELS 3", "CHANNELS 33333333333", "braces do not match"),
+        ("0.04", "-0.04", "frame time"),
+        ("0.04", "inf", "frame time"),
         ("0.04", "0,04", "float: '0,04'"),
         ("\n}\nMOTION", "\nMOTION", "the hierarchy does not end"),
         ("\nMOTION", "\n}\nMOTION", "braces do not match"),
@@ -178,6 +179,74 @@ def test_a_frame_rate_is_the_files_where_the_name_is_not_cmus(tmp_path: Path) ->
     assert not any("frame rate" in finding for finding in clip.findings)
 
 
+def test_a_frame_time_of_zero_is_no_rate(tmp_path: Path) -> None:
+    text = cmu_bvh(walk()).replace("Frame Time: .0083333", "Frame Time: 0.0")
+    (clip,) = read(write(tmp_path / "pose.bvh", text))
+    assert np.isnan(clip.frame_rate_hz)
+    assert any("frame rate is not known" in finding for finding in clip.findings)
+    assert clip.thinned(30.0) is clip
+    (known,) = read(write(tmp_path / "02_01.bvh", text))
+    assert known.frame_rate_hz == 120.0
+    assert any("the file says no rate" in finding for finding in known.findings)
+
+
+@pytest.mark.parametrize("value", ["nan", "-inf"])
+def test_a_frame_with_a_number_that_is_none_is_dropped(tmp_path: Path, value: str) -> None:
+    text = renamed("{side}{limb}", LIMBS, ("Right", "Left"))
+    end = text.index("End Site", text.index("JOINT Head"))
+    text = text[:end] + JAW + text[text.index("}", end) + 1 :]  # its head top is reckoned
+    lines = text.splitlines()
+    words = lines[-4].split()
+    lines[-4] = " ".join([*words[:7], value, *words[8:]])
+    (truth,) = read(write(tmp_path / "whole.bvh", text))
+    (clip,) = read(write(tmp_path / "gap.bvh", "\n".join(lines)))
+    assert "1 frames with missing joints dropped" in clip.findings
+    kept = np.isin(truth.frames, clip.frames)
+    assert np.count_nonzero(~kept) == 1
+    assert_allclose(clip.positions_mm, truth.positions_mm[kept], atol=0.5)
+
+
+def with_places(text: str, *, idle: bool) -> str:
+    """The motion with six channels at every joint: its offset each time, or zeros."""
+    head, motion = text.split("MOTION\n")
+    count, time, *rows = motion.splitlines()
+    offsets = [
+        found.groups()
+        for found in re.finditer(r"OFFSET (\S+) (\S+) (\S+)\n\s*CHANNELS", head, re.MULTILINE)
+    ]
+    lines = []
+    for row in rows:
+        words = row.split()
+        wide = words[:6]
+        for number, offset in enumerate(offsets[1:], 1):
+            turns = words[3 + 3 * number : 6 + 3 * number]
+            wide += [*(("0", "-0.0", "0") if idle else offset), *turns]
+        lines.append(" ".join(wide))
+    head = head.replace("CHANNELS 3", "CHANNELS 6 Xposition Yposition Zposition")
+    if not idle:
+        head = re.sub(r"OFFSET .*(?=\n\s*CHANNELS)", "OFFSET 0 0 0", head)
+    return "\n".join([f"{head}MOTION", count, time, *lines]) + "\n"
+
+
+@pytest.mark.parametrize("idle", [False, True])
+def test_places_at_every_joint(tmp_path: Path, idle: bool) -> None:
+    """Some programs write them instead of offsets, others as zeros beside them."""
+    text = cmu_bvh(walk()).replace("Spine1", "Spine2")
+    truth = parse(write(tmp_path / "plain.bvh", text))
+    found = parse(write(tmp_path / "six.bvh", with_places(text, idle=idle)))
+    assert_allclose(world_positions(found), world_positions(truth), atol=1e-6)
+
+
+def test_offsets_of_zero_beside_places_are_no_lost_thorax(tmp_path: Path) -> None:
+    text = cmu_bvh(walk())
+    whole = text.replace("OFFSET 0.00000000 0.00000000 0.00000000", "OFFSET 0 2.06523 0")
+    for file in (text, whole):
+        (clip,) = read(write(tmp_path / "six.bvh", with_places(file, idle=False)))
+        assert clip.findings[0] == "joint names: MotionBuilder"
+    (again,) = read(write(tmp_path / "02_01.bvh", with_places(text, idle=True)))
+    assert "thorax of 117 mm above" in " ".join(again.findings)
+
+
 def test_unknown_names_are_listed_and_a_mapping_file_helps(tmp_path: Path) -> None:
     text = re.sub(r"(ROOT|JOINT) (\w+)", r"\1 my\2", cmu_bvh(walk()))
     path = write(tmp_path / "dance.bvh", text)
@@ -230,6 +299,8 @@ def test_a_bad_mapping_file_is_named(tmp_path: Path, content: str, problem: str)
 
 LIMBS = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
 BLENDER = ("upper_arm", "forearm", "hand", "thigh", "shin", "foot")
+ROKOKO = ("Arm", "ForeArm", "Hand", "Thigh", "Shin", "Foot")
+SMPL_X = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 BIPED = ("UpperArm", "Forearm", "Hand", "Thigh", "Calf", "Foot")
 
 
@@ -249,6 +320,9 @@ def renamed(pattern: str, limbs: tuple[str, ...], sides: tuple[str, str]) -> str
         ("MotionBuilder", "mixamorig:{side}{limb}", LIMBS, ("Right", "Left")),
         ("MotionBuilder", "mixamorig1_{side}{limb}", LIMBS, ("Right", "Left")),
         ("MotionBuilder", "Ann|{side}{limb}", LIMBS, ("Right", "Left")),
+        ("MotionBuilder", "Character1_{side}{limb}", LIMBS, ("Right", "Left")),
+        ("Rokoko", "{side}{limb}", ROKOKO, ("Right", "Left")),
+        ("SMPL-X", "{side}_{limb}", SMPL_X, ("right", "left")),
         ("Blender", "{limb}.{side}", BLENDER, ("R", "L")),
         ("Blender", "DEF-{limb}_{side}", BLENDER, ("R", "L")),
         ("Character Studio biped", "Bip01 {side} {limb}", BIPED, ("R", "L")),
@@ -265,14 +339,19 @@ def test_names_of_other_programs(
     assert_allclose(centred(clip)[:, legs], centred(truth)[:, legs], atol=0.05)
 
 
-def test_a_head_without_its_top(tmp_path: Path) -> None:
-    """Of Mixamo as some exporters write it: other bones hang on the head, it has no end site."""
+JAW = "JOINT Jaw\n{\nOFFSET 0 0.5 0.5\nCHANNELS 0\nEnd Site\n{\nOFFSET 0 0 1\n}\n}\n"
+
+
+@pytest.mark.parametrize(
+    "tip", [JAW, "End Site\n{\nOFFSET 0.000000 0.0 -0.0\n}\n", "End Site\n{\n}\n"]
+)
+def test_a_head_without_its_top(tmp_path: Path, tip: str) -> None:
+    """Other bones hang on it, as in some files of Mixamo, or its end site has no length."""
     text = renamed("mixamorig:{side}{limb}", LIMBS, ("Right", "Left"))
     head = text.index("JOINT Head")
     end = text.index("End Site", head)
-    jaw = "JOINT Jaw\n{\nOFFSET 0 0.5 0.5\nCHANNELS 0\nEnd Site\n{\nOFFSET 0 0 1\n}\n}\n"
     close = text.index("}", end) + 1
-    (clip,) = read(write(tmp_path / "a.bvh", text[:end] + jaw + text[close:]))
+    (clip,) = read(write(tmp_path / "a.bvh", text[:end] + tip + text[close:]))
     assert clip.findings[0] == "joint names: MotionBuilder, no head top"
     assert "head top at 0.47 of the trunk beyond the neck assumed" in clip.findings
     positions = clip.positions_mm.astype(np.float64)

@@ -139,6 +139,18 @@ def test_generic_files_are_written_and_read(tmp_path: Path, poses: Float) -> Non
         assert str(held["license"]) == "free; own"
 
 
+def test_recordings_strung_together_are_not_taken_for_one(tmp_path: Path, poses: Float) -> None:
+    """The second one would be lost: a library keeps each frame of a clip once."""
+    path, frame = tmp_path / "two.npz", np.r_[np.arange(20), np.arange(20)]
+    np.savez(path, positions=poses, frame=frame)
+    with pytest.raises(MocapError, match=r"'two' has several poses under one .* clips of their"):
+        read(path)
+    np.savez(path, positions=poses, frame=frame, clip=np.repeat([0, 1], 20))
+    assert [len(clip) for clip in read(path)] == [20, 20]
+    np.savez(path, positions=np.r_[poses[:20], poses[:20]], frame=frame)
+    assert len(read(path)[0]) == 40, "the same poses twice are no doubt which is which"
+
+
 def test_a_clip_without_a_licence_does_not_get_that_of_another(
     tmp_path: Path, poses: Float
 ) -> None:
@@ -179,6 +191,7 @@ def test_generic_files_in_another_joint_order(tmp_path: Path, poses: Float) -> N
         ({"positions": np.zeros((4, 13, 3))}, "wanted is"),
         ({"positions": np.zeros((0, 14, 3))}, "wanted is"),
         ({"positions": np.array(["a"])}, "numbers"),
+        ({"positions": np.array(7)}, r"are \(\)"),
         ({"positions": np.ones((4, 14, 3)), "clip": np.zeros(3, int)}, "clip must be 4"),
         ({"positions": np.ones((4, 14, 3)), "frame": np.arange(4) - 1}, "no frame numbers"),
         ({"positions": np.ones((4, 14, 3)), "frame": np.arange(4) + 2**31}, "no frame numbers"),
@@ -216,6 +229,19 @@ def test_damaged_files_are_refused(tmp_path: Path, poses: Float) -> None:
         archive.writestr("positions.npy", b"\x93NUMPY\x01\x00")
     with pytest.raises(MocapError, match="cannot be read"):
         read(path)
+
+
+def test_a_gap_in_smpl_joints_costs_its_frames_only(tmp_path: Path, poses: Float) -> None:
+    joints = spread(poses, SMPL, 24)
+    np.savez(tmp_path / "whole.npz", joints=joints)
+    joints[3] = np.nan
+    np.savez(tmp_path / "gap.npz", joints=joints)
+    (whole,), (gap,) = read(tmp_path / "whole.npz"), read(tmp_path / "gap.npz")
+    assert gap.frames.tolist() == [frame for frame in range(len(poses)) if frame != 3]
+    assert_allclose(gap.positions_mm, whole.positions_mm[gap.frames], atol=0.1)
+    np.savez(tmp_path / "none.npz", joints=joints * np.nan)
+    with pytest.raises(MocapError, match="has no frame with all 14 joints"):
+        read(tmp_path / "none.npz")
 
 
 def test_smpl_joints(tmp_path: Path, poses: Float) -> None:

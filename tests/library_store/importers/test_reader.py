@@ -32,6 +32,16 @@ def test_strict_refuses_it(folder: Path) -> None:
         read_all([folder], strict=True)
 
 
+def test_what_macos_keeps_beside_files_is_none_of_them(folder: Path) -> None:
+    (folder / "02" / "02_02.amc").unlink()
+    (folder / "02" / "02.asf").rename(folder / "02" / "person.asf")
+    for name in ("02/._02_01.amc", "02/._person.asf", "._02_01.BVH"):
+        (folder / name).write_bytes(b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X")
+    clips, skipped = read_all([folder], strict=True)
+    assert [clip.name for clip in clips] == ["02_01", "02_01"]
+    assert skipped == []
+
+
 def test_a_bad_mapping_file_is_not_every_files_fault(folder: Path) -> None:
     mapping = folder / "mapping.json"
     mapping.write_text("{}")
