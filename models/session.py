@@ -103,6 +103,20 @@ class OnnxModel:
         """What a pose network makes of crops (N, S, S, 3) uint8 BGR."""
         return Seen(*self._session.run(self._outputs, {self._input: crops}))
 
+    def warm_up(self, batch: NDArray[Any]) -> None:
+        """Run a batch before any photo does; ``ModelError`` if it is too much, for a GPU's memory.
+
+        Who asks for it knows how large the largest may be.
+        """
+        try:
+            self.run(batch)
+        except Exception as error:
+            n, height, width, _ = batch.shape
+            raise ModelError(
+                f"model {self.card.name} runs on {self.runtime.provider}, but not on {n} images of "
+                f"{width}x{height} px at once ({_said(error)}): choose another model or provider"
+            ) from error
+
     def _check(self, probe: _Probe) -> None:
         """The network takes and gives what its card says, in batches; ``ModelError`` if not."""
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()

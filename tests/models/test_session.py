@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from library_store.skeleton import LSP14
 from models import ModelError, PersonDetector, PoseEstimator
 from models.card import WEIGHTS_DIR, LiftOutput, read_card
 from models.choice import choose
@@ -239,6 +240,18 @@ def test_a_batch_gives_what_its_images_give_alone(name: str) -> None:
         assert alone.depths is not None
         np.testing.assert_allclose(alone.maps[0], together.maps[i], atol=1e-3)
         np.testing.assert_allclose(alone.depths[0], together.depths[i], atol=1e-5)
+
+
+def test_what_runs_for_two_people_and_not_for_ten_is_refused_at_start(tmp_path: Path) -> None:
+    shape = tiny_onnx.constant("shape", np.array([2, 15, 32, 32]))
+    nodes = [node("Concat", ["planes"] * 5, "many", axis=1), shape]
+    nodes += [node("Reshape", ["many", "shape"], "two")]
+    output = tiny_onnx.card("tiny", b"")["output"] | {"joint_names": LSP14.joint_names}  # type: ignore[operator]
+    tiny_onnx.write(tmp_path, "tiny", tiny_onnx.model(planes(*nodes, last="two")), output=output)
+    estimator = PoseEstimator("tiny", weights_dir=tmp_path)
+    estimator.warm_up(2)
+    with pytest.raises(ModelError, match="tiny runs on cpu, but not on 10 images of 32x32 px"):
+        estimator.warm_up(10)
 
 
 def test_a_provider_that_is_not_installed_is_refused() -> None:
