@@ -11,6 +11,8 @@ from models.errors import ModelError
 from models.providers import ProviderChoice, cpu_features, present_providers, runtime_of
 from models.session import cost_ms
 
+Kind = Literal["pose", "people", "lift"]
+"""What networks are there for, as their cards' outputs have it."""
 AS_GOOD = 0.005
 """Accuracies that differ by less are one: then the cheaper network is the better one."""
 
@@ -23,14 +25,14 @@ class Candidate:
     cost_ms: float
 
 
-def cards_of(
-    directory: Path, kind: Literal["pose", "people", "lift"], *, needed: bool = True
-) -> list[ModelCard]:
+def cards_of(directory: Path, kind: Kind, *, needed: bool = True) -> list[ModelCard]:
     """All cards of one kind, by name.
 
     Raises ``ModelError`` for a bad card or, if one is ``needed``, no card at all.
     """
-    cards = [read_card(path) for path in sorted(directory.glob("*.json"))]
+    paths = sorted(directory.glob("*.json"))
+    # Hidden files are none: macOS puts one beside each that it copies to other disks.
+    cards = [read_card(path) for path in paths if not path.name.startswith(".")]
     found = [card for card in cards if card.output.kind == kind]
     if needed and not found:
         raise ModelError(

@@ -157,7 +157,7 @@ class PersonDetector:
         long = -(-self._output.long_side_px // GRID_PX) * GRID_PX
         for short in range(GRID_PX, long + 1, GRID_PX):
             for height, width in {(short, long), (long, short)}:
-                self._model.run(np.zeros((1, height, width, 3), np.uint8))
+                self._model.warm_up(np.zeros((1, height, width, 3), np.uint8))
 
     def detect(
         self, image: NDArray[np.uint8], max_people: int, *, threshold: float | None = None

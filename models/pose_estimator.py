@@ -56,7 +56,7 @@ class PoseEstimator:
         """Run the batch sizes up to ``people``: all but the CPU's provider compile each anew."""
         size = self._output.input_px
         for count in range(people if self.runtime.provider == "cpu" else 1, people + 1):
-            self._model.run(np.zeros((count, size, size, 3), np.uint8))
+            self._model.warm_up(np.zeros((count, size, size, 3), np.uint8))
 
     def estimate(self, image: NDArray[np.uint8], boxes: Sequence[PersonBox]) -> list[Joints2D]:
         """Joints of the person in each box of a photo (H, W, 3) uint8 BGR, one batch for all."""

@@ -66,9 +66,12 @@ class OnnxModel:
         self._path = directory / self.card.file
         weights = read_weights(self._path, self.card)
         candidates = runtimes(self.card, provider)
+        probe = _probe(self.card)
         for runtime in candidates:
             try:
                 session = open_session(weights, runtime, threads=threads, concurrency=concurrency)
+                if runtime.provider != "cpu":  # a GPU too old or too full fails when it first runs
+                    session.run(None, {session.get_inputs()[0].name: probe.batch})
             except Exception as error:
                 if runtime.provider == "cpu":
                     raise self._error(
@@ -85,7 +88,7 @@ class OnnxModel:
             else:
                 self._session, self.runtime = session, runtime
                 break
-        self._check()
+        self._check(probe)
 
     def run(self, batch: NDArray[Any]) -> NDArray[np.float32]:
         """What the network makes of a batch, float32.
@@ -100,9 +103,22 @@ class OnnxModel:
         """What a pose network makes of crops (N, S, S, 3) uint8 BGR."""
         return Seen(*self._session.run(self._outputs, {self._input: crops}))
 
-    def _check(self) -> None:
+    def warm_up(self, batch: NDArray[Any]) -> None:
+        """Run a batch before any photo does; ``ModelError`` if it is too much, for a GPU's memory.
+
+        Who asks for it knows how large the largest may be.
+        """
+        try:
+            self.run(batch)
+        except Exception as error:
+            n, height, width, _ = batch.shape
+            raise ModelError(
+                f"model {self.card.name} runs on {self.runtime.provider}, but not on {n} images of "
+                f"{width}x{height} px at once ({_said(error)}): choose another model or provider"
+            ) from error
+
+    def _check(self, probe: _Probe) -> None:
         """The network takes and gives what its card says, in batches; ``ModelError`` if not."""
-        probe = _probe(self.card)
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         kinds = [it.type for it in (*inputs, *outputs)]
         if len(inputs) != 1 or kinds != [probe.kind, *["tensor(float)"] * len(probe.answers)]:

@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 from rich.markup import escape
@@ -19,7 +19,7 @@ from models import ModelCard, ModelError, ProviderChoice
 from models.caffe import LICENCE, JointOrder
 from models.caffe import import_caffe as import_network
 from models.card import read_card, write_card
-from models.choice import cards_of
+from models.choice import Kind, cards_of
 from models.cost import with_cost
 from models.pose_lifter import lifter_names
 from models.session import OnnxModel
@@ -132,7 +132,7 @@ def export(
 ) -> None:
     """Make a training run's checkpoint into an ONNX file and its card.
 
-    Serve it with POSEMATCH_WEIGHTS_DIR=OUT POSEMATCH_MODEL=NAME.
+    Serve it with POSEMATCH_WEIGHTS_DIR=OUT, and POSEMATCH_MODEL=NAME if it is a pose network.
     """
     if kind not in {"cpm", "person"}:
         raise typer.BadParameter("cpm or person", param_hint="--kind")
@@ -143,7 +143,7 @@ def export(
     network: training.Kind = "cpm" if kind == "cpm" else "person"
     card = training.export(checkpoint, out, network, version=version, name=name, size_px=input_px)
     OnnxModel(out, card.name)
-    _complete(out, load_settings().weights_dir)
+    _complete(out, load_settings().weights_dir, card)
     output.print(f"{out / card.file}, {card.name}.json", highlight=False, markup=False)
 
 
@@ -217,7 +217,7 @@ def finetune(
             threads=threads,
         ),
     )
-    _complete(out, settings.weights_dir)
+    _complete(out, settings.weights_dir, result.card)
     table = Table(title=f"{result.n_trained} people trained on, {result.n_held_out} held out")
     for heading in ("PCK@0.2 of those held out", "%"):
         table.add_column(heading)
@@ -255,18 +255,25 @@ def import_caffe(
     card = import_network(
         prototxt, caffemodel, out, name=name, joints=joints, licence=licence or LICENCE
     )
-    _complete(out, settings.weights_dir)
+    _complete(out, settings.weights_dir, card)
     output.print(_card_table(card))
 
 
-def _complete(directory: Path, source: Path) -> None:
-    """Copy the other networks beside a new pose network, so that the directory can be served."""
+def _complete(directory: Path, source: Path, made: ModelCard) -> None:
+    """Copy networks of the other kinds beside a new one, so that the directory can be served.
+
+    None of its own kind: the new one is what is to be served.
+    """
     if directory.resolve() == source.resolve():
         return
-    for card in [*cards_of(source, "people"), *cards_of(source, "lift", needed=False)]:
-        for file in (card.file, f"{card.name}.json"):
-            if not (directory / file).exists():
-                shutil.copy(source / file, directory / file)
+    for kind in get_args(Kind):
+        if kind == made.output.kind:
+            continue
+        for card in cards_of(source, kind, needed=kind != "lift"):
+            # The card comes last: a copy that was broken off is made anew.
+            if not (directory / f"{card.name}.json").exists():
+                for file in (card.file, f"{card.name}.json"):
+                    shutil.copy(source / file, directory / file)
 
 
 def _needs_training(error: ModuleNotFoundError) -> Exception:

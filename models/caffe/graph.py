@@ -87,24 +87,27 @@ class _Builder:
         self._side = side[0]
         if self._side > MOST_PX:
             raise CaffeError(f"inputs of {self._side} px; at most {MOST_PX} can be imported")
+        self._node("Cast", [IMAGE], "pixels", to=onnx_file.FLOAT)
+        self._node("Transpose", ["pixels"], "planes", perm=[0, 3, 1, 2])
         for name, shape in net.inputs.items():
             self._define(name, self._input(shape[1]))
 
     def _input(self, channels: int) -> Blobs:
         parts = []
         if channels != 1:
-            self._node("Cast", [IMAGE], "pixels", to=onnx_file.FLOAT)
-            self._node("Transpose", ["pixels"], "planes", perm=[0, 3, 1, 2])
             scale = self._tensor("pixel_scale", np.array(_PIXEL_SCALE, np.float32))
             self._node("Mul", ["planes", scale], "scaled")
             mean = self._tensor("pixel_mean", np.array(-_PIXEL_MEAN, np.float32))
             parts.append(self._node("Add", ["scaled", mean], "centred"))
         if channels != 3:
+            # One for each image, by arithmetic alone: GPUs leave the reckoning with shapes to the
+            # CPU, and a network of which they cannot run every node is not run by them at all.
+            ends = [self._tensor(f"plane_{i}", np.array([i], np.int64)) for i in range(2)]
+            nothing = self._tensor("nothing", np.array(0, np.float32))
             one = self._tensor("center_map", center_map(self._side))
-            rest = self._tensor("center_axes", np.array([1, self._side, self._side], np.int64))
-            self._node("Shape", [IMAGE], "batch", start=0, end=1)
-            self._node("Concat", ["batch", rest], "center_shape", axis=0)
-            parts.append(self._node("Expand", [one, "center_shape"], "center_maps"))
+            self._node("Slice", ["planes", *ends, ends[1]], "plane")
+            self._node("Mul", ["plane", nothing], "zeros")
+            parts.append(self._node("Add", ["zeros", one], "center_maps"))
         name = parts[0]
         if len(parts) > 1:
             name = self._node("Concat", parts, "image_and_center", axis=1)

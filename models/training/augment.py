@@ -129,7 +129,8 @@ def in_company(crop: LabelledCrop, other: LabelledCrop, rng: np.random.Generator
     other_center, other_extent = other.extent_px
     scale = extent / other_extent * float(np.exp(rng.normal(0, 0.15)))
     flip = bool(rng.random() < 0.5)
-    reach = 0.5 * (np.ptp(crop.joints_px, axis=0) + scale * np.ptp(other.joints_px, axis=0))
+    sides = [np.ptp(one.joints_px[one.weight > 0], axis=0) for one in (crop, other)]
+    reach = 0.5 * (sides[0] + scale * sides[1])
     way = rng.normal(0, 0.35 if not crop.wild else 1.0) + (np.pi if rng.random() < 0.5 else 0)
     aside = rng.uniform(0.35, 0.9) * reach * np.array([np.cos(way), np.sin(way)])
     shift = (center + aside - other_center * scale * (-1 if flip else 1, 1)).astype(np.float64)

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from models.card import ModelCard, PoseOutput, read_card, write_card
+from models.card import read_weights as read_file
 from models.errors import AnnotationError, ModelError
 from models.heatmaps import read_maps
 from models.looks import looked_at
@@ -124,6 +125,7 @@ def finetune(
         raise ModelError(
             f"{out} is where {start} lies, which would be overwritten: give another --name or --out"
         )
+    read_file(path, before_card)  # it is there, whole and the card's
     try:
         config = config_of(read_weights(path))
     except KeyError as error:

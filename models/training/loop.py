@@ -153,7 +153,8 @@ def fit(
     """Train ``model`` as ``args`` says, resuming from ``args.out / last.pt`` when it is there.
 
     ``make_batch(step, size=pixels)`` makes a batch on the CPU, ``loss_of(model, batch)`` its loss,
-    ``evaluate(averaged model, size_px)`` the metrics that are logged.
+    ``evaluate(averaged model, size_px)`` the metrics that are logged. ``ModelError`` when the loss
+    is no number any more; what has been kept of the run is from before.
     """
     torch.manual_seed(args.seed)
     torch.set_num_threads(args.threads)
@@ -195,12 +196,18 @@ def fit(
                     g["lr"] = rate * factor
             model.train()
             loss = loss_of(model, tuple(t.to(args.device) for t in batch))
+            value = float(loss.detach())
+            if not math.isfinite(value):
+                feeder.close()
+                raise ModelError(
+                    f"{args.out}: the loss of step {step} is {value}: go on, from the last "
+                    "evaluation, at a lower rate of learning (--lr)"
+                )
             loss.backward()  # type: ignore[no-untyped-call]
             for o in optimizers:
                 o.step()
                 o.zero_grad(set_to_none=True)
             _average_into(ema, model, min(EMA_DECAY, (1 + step) / (10 + step)))
-            value = float(loss.detach())
             running = value if math.isnan(running) else 0.98 * running + 0.02 * value
             step += 1
             if progress() >= 1 or size_now() != size:

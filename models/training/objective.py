@@ -23,7 +23,7 @@ COARSE_SIGMA_CELLS, FINE_SIGMA_CELLS = 0.8, 1.2
 
 def gaussian_targets(joints_px: Tensor, cells: int, stride: float, sigma_cells: float) -> Tensor:
     """(B, J, 2) pixels -> (B, J, cells, cells) maps with peak value 1."""
-    axis = torch.arange(cells, dtype=torch.float32)
+    axis = torch.arange(cells, dtype=torch.float32, device=joints_px.device)
     # The centre of cell c lies at pixel (c + 0.5) * stride - 0.5.
     at = (joints_px + 0.5) / stride - 0.5
     gx = torch.exp(-((axis - at[..., :1]) ** 2) / (2 * sigma_cells**2))

@@ -5,13 +5,14 @@ knees and ankles with ``left_``/``right_`` (or ``l_``/``r_``) before them, and `
 ``head_top`` where there are any; others (eyes, ears, toes) are left out, and so are categories
 without these limbs. Visibility is COCO's: 0 not labelled, 1 labelled but hidden, 2 seen; null and
 NaN, which some tools write for what is not labelled, are taken for 0. Pixels are those of the
-stored file; of the photo turned upright, as its EXIF orientation says, where only that has the size
-which the file of labels states (phones' photos in tools that show them upright).
+stored file, or of the photo turned upright, as its EXIF orientation says (phones' photos in tools
+that show them upright): whichever has the size that the file of labels states.
 """
 
 from __future__ import annotations
 
 import codecs
+import hashlib
 import re
 from pathlib import Path
 
@@ -105,12 +106,13 @@ def read_coco(annotations: Path, images: Path) -> list[LabelledCrop]:
             f"{annotations}: nobody has {LEAST_JOINTS} labelled joints or more; nothing to learn"
         )
     crops = []
-    groups: dict[str, int] = {}
+    groups: dict[bytes, int] = {}
     for image_id, persons in sorted(people.items()):
         file = files[image_id]
-        # Merged sets have files twice: whoever is held out must not be trained on under another id.
-        group = groups.setdefault(file.file_name, image_id)
         pixels = _read_image(annotations, images, file)
+        # Merged sets have photos twice: whoever is held out must not be trained on under another
+        # id or name.
+        group = groups.setdefault(hashlib.sha256(pixels.tobytes()).digest(), image_id)
         for name, points in persons:
             _check_points(annotations, name, points, pixels)
             crops.append(cut_out(f"{file.file_name}/{name}", group, pixels, points))
@@ -227,21 +229,33 @@ def _read_image(annotations: Path, folder: Path, record: _Image) -> Image:
             f"{annotations}: image {record.id} is {path}, which does not exist; "
             "is this the folder that file_name is relative to?"
         )
-    sizes = []
-    for way in (cv2.IMREAD_IGNORE_ORIENTATION, 0):
-        pixels = cv2.imread(str(path), cv2.IMREAD_COLOR | way)
-        if pixels is None:
-            raise AnnotationError(f"{path} is no image that can be decoded")
-        height, width = pixels.shape[:2]
-        stated = record.width or width, record.height or height
-        if stated == (width, height):
-            return np.asarray(pixels, np.uint8)
-        sizes.append((width, height))
-    raise AnnotationError(
-        f"{path} is {sizes[0][0]}x{sizes[0][1]} px, but {annotations} labelled an image of "
-        f"{record.width or sizes[0][0]}x{record.height or sizes[0][1]}: it was resized or turned "
-        "since"
-    )
+    data = path.read_bytes()
+    ways = [cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION]
+    if b"exif" in data.lower():
+        ways.append(cv2.IMREAD_COLOR)
+    decoded = [cv2.imdecode(np.frombuffer(data, np.uint8), way) if data else None for way in ways]
+    found = [np.asarray(pixels, np.uint8) for pixels in decoded if pixels is not None]
+    if not found:
+        raise AnnotationError(f"{path} is no image that can be decoded")
+    height, width = found[0].shape[:2]
+    fitting = [
+        pixels
+        for pixels in found
+        if record.width in (None, 0, pixels.shape[1])
+        and record.height in (None, 0, pixels.shape[0])
+    ]
+    if not fitting:
+        raise AnnotationError(
+            f"{path} is {width}x{height} px, but {annotations} labelled an image of "
+            f"{record.width or width}x{record.height or height}: it was resized or turned since"
+        )
+    if not np.array_equal(fitting[0], fitting[-1]):
+        raise AnnotationError(
+            f"{path} is to be turned by its EXIF orientation, and {annotations} does not tell "
+            "whether it was labelled so: its size fits either way. Store it turned, without the "
+            "orientation; if it was labelled as it is stored, drop the orientation alone"
+        )
+    return fitting[0]
 
 
 def _check_points(path: Path, name: str, points: NDArray[np.float64], pixels: Image) -> None:

@@ -76,10 +76,10 @@ def _poses(path: Path) -> NDArray[np.float64]:
     """(F, 32, 2) pixels."""
     if path.suffix == ".npz":
         try:
-            with np.load(path, allow_pickle=False) as arrays:
+            with path.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
                 values = np.asarray(arrays["Pose"], np.float64)
-        except (KeyError, ValueError, OSError) as error:
-            raise AnnotationError(f"{path}: no array Pose can be read: {error}") from error
+        except Exception as error:  # a reader of foreign bytes fails in every way
+            raise AnnotationError(f"{path}: no array Pose can be read: {error!r}") from error
     else:
         try:
             from cdflib import CDF
@@ -91,7 +91,7 @@ def _poses(path: Path) -> NDArray[np.float64]:
             values = np.asarray(CDF(path).varget("Pose"), np.float64)
         except Exception as error:  # a reader of foreign bytes fails in every way
             raise AnnotationError(f"{path}: no CDF file with a variable Pose: {error!r}") from error
-    if values.size == 0 or values.shape[-1] not in {64, 2} or values.size % 64:
+    if values.size == 0 or (values.shape[-1:] != (64,) and values.shape[-2:] != (32, 2)):
         raise AnnotationError(
             f"{path}: Pose is {values.shape}; wanted is (F, 64), 32 joints in pixels. "
             "3D positions are for 'posematch library import'"

@@ -8,7 +8,7 @@ import pytest
 
 from models import ModelError
 from models.card import WEIGHTS_DIR, read_card
-from models.choice import choose
+from models.choice import cards_of, choose
 from models.providers import cpu_features, cpu_name, runtime_of
 from models.session import runtimes
 from tests.models import tiny_onnx
@@ -110,3 +110,9 @@ def test_the_shipped_cards_have_what_the_choice_needs(kind: str) -> None:
         assert card.precision == ("fp32" if features == OLD else "int8")
         assert all(cost > 0 for cost in card.cost_ms.values())
         assert card.cost_ms
+
+
+def test_what_macos_puts_beside_cards_is_none(cards: Path) -> None:
+    (cards / "._small.json").write_bytes(b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X")
+    names = {card.name for card in cards_of(cards, "pose")}
+    assert names == {"small", "small-int8", "large", "unmeasured"}

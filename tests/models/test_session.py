@@ -3,17 +3,19 @@
 import json
 import logging
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from library_store.skeleton import LSP14
 from models import ModelError, PersonDetector, PoseEstimator
 from models.card import WEIGHTS_DIR, LiftOutput, read_card
 from models.choice import choose
 from models.session import OnnxModel, made_up_joints
-from tests.cuda import claim_cuda
+from tests.cuda import claim_cuda, claim_cuda_that_cannot_run
 from tests.models import tiny_onnx
 from tests.models.tiny_onnx import FLOAT16, node, planes
 
@@ -240,18 +242,34 @@ def test_a_batch_gives_what_its_images_give_alone(name: str) -> None:
         np.testing.assert_allclose(alone.depths[0], together.depths[i], atol=1e-5)
 
 
+def test_what_runs_for_two_people_and_not_for_ten_is_refused_at_start(tmp_path: Path) -> None:
+    shape = tiny_onnx.constant("shape", np.array([2, 15, 32, 32]))
+    nodes = [node("Concat", ["planes"] * 5, "many", axis=1), shape]
+    nodes += [node("Reshape", ["many", "shape"], "two")]
+    output = tiny_onnx.card("tiny", b"")["output"] | {"joint_names": LSP14.joint_names}  # type: ignore[operator]
+    tiny_onnx.write(tmp_path, "tiny", tiny_onnx.model(planes(*nodes, last="two")), output=output)
+    estimator = PoseEstimator("tiny", weights_dir=tmp_path)
+    estimator.warm_up(2)
+    with pytest.raises(ModelError, match="tiny runs on cpu, but not on 10 images of 32x32 px"):
+        estimator.warm_up(10)
+
+
 def test_a_provider_that_is_not_installed_is_refused() -> None:
     with pytest.raises(ModelError, match="has only cpu; install onnxruntime-gpu"):
         OnnxModel(WEIGHTS_DIR, "cpm", provider="cuda")
 
 
+@pytest.mark.parametrize("claim", [claim_cuda, claim_cuda_that_cannot_run])
 def test_a_provider_that_fails_is_refused_when_asked_for_and_replaced_by_auto(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    claim: Callable[[pytest.MonkeyPatch], None],
 ) -> None:
-    """onnxruntime claims CUDA as its GPU build does where there is no driver: the session falls
-    back to the CPU without an error."""
+    """Without a driver onnxruntime's session falls back to the CPU without an error; on a GPU that
+    is too old, or has no memory left, it fails when it first runs."""
     tiny_onnx.write(tmp_path, "tiny", SOUND)
-    claim_cuda(monkeypatch)
+    claim(monkeypatch)
     with pytest.raises(ModelError, match="POSEMATCH_PROVIDER=cuda: cuda cannot run model tiny"):
         OnnxModel(tmp_path, "tiny", provider="cuda")
     with caplog.at_level(logging.WARNING):

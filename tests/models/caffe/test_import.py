@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from library_store.skeleton import LSP14
 from models import PoseEstimator
-from models.caffe import JOINT_ORDERS, import_caffe
+from models.caffe import JOINT_ORDERS, import_caffe, wire
 from models.caffe.caffemodel import read_caffemodel
 from models.errors import CaffeError
 from models.person_detector import PersonBox
@@ -113,6 +113,21 @@ def test_it_serves_by_its_card_and_finds_what_is_there(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.positions_px, np.tile(at, (14, 1)), atol=0.5)
     assert found.confidence is None
     assert found.sigma_px is None
+
+
+def test_every_node_is_one_that_a_gpu_runs(tmp_path: Path) -> None:
+    """Shapes are reckoned with on the CPU by CUDA, to which the service leaves no node."""
+    steps = caffe_files.vgg_like(divide=64, n_stages=2)
+    paths = caffe_files.write(tmp_path, steps, caffe_files.random_weights(steps), SIDE_PX)
+    card = import_caffe(*paths, tmp_path)
+
+    def parts(data: Any, field: int) -> list[Any]:
+        return [value for number, _, value in wire.fields(memoryview(data)) if number == field]
+
+    (graph,) = parts((tmp_path / card.file).read_bytes(), 7)
+    operators = {bytes(kind).decode() for node in parts(graph, 1) for kind in parts(node, 4)}
+    assert operators >= {"Conv", "AveragePool"}
+    assert not operators & {"Shape", "Size", "ConstantOfShape"}
 
 
 def test_the_card_says_whose_weights_they_are(tmp_path: Path) -> None:

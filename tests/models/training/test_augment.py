@@ -1,12 +1,17 @@
 """What photos go through before a network sees them in training."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from models.training.augment import expose, shaken, worsen
-from models.training.dataset import Image
+from library_store.skeleton import HEAD_TOP, NECK
+from models.training.augment import expose, in_company, shaken, worsen
+from models.training.dataset import Image, LabelledCrop
+from models.training.users_coco import read_coco
+from tests.models.training import user_files
 
 
 def photo(seed: int = 0) -> Image:
@@ -57,3 +62,23 @@ def test_shaking_smears_along_its_line_and_moves_nothing(angle_deg: float) -> No
     across = np.sqrt((smeared * (y * cos - x * sin) ** 2).sum() / total)
     assert along == pytest.approx(12 / np.sqrt(12), rel=0.2)
     assert across < 0.6
+
+
+def test_where_joints_without_a_label_are_said_to_lie_does_not_matter(tmp_path: Path) -> None:
+    """COCO labels neither head nor neck: to be in company they must not reach into a corner."""
+    records = user_files.coco(tmp_path / "images")
+    people = read_coco(user_files.write(tmp_path / "l.json", records), tmp_path / "images")
+
+    def labelled_elsewhere(crop: LabelledCrop) -> LabelledCrop:
+        assert not crop.weight[[HEAD_TOP, NECK]].any()
+        joints = crop.joints_px.copy()
+        joints[[HEAD_TOP, NECK]] = joints[NECK + 1]
+        return replace(crop, joints_px=joints)
+
+    for seed in range(5):
+        views = [
+            in_company(view(people[0]), view(people[2]), np.random.default_rng(seed)).image
+            for view in (lambda crop: crop, labelled_elsewhere)
+        ]
+        assert not np.array_equal(views[0], people[0].image)
+        np.testing.assert_array_equal(views[0], views[1])

@@ -14,7 +14,8 @@ pytest.importorskip("onnx")
 
 from app.cli import cli  # noqa: E402
 from models import ModelError, PoseEstimator  # noqa: E402
-from models.card import WEIGHTS_DIR  # noqa: E402
+from models.card import WEIGHTS_DIR, read_card  # noqa: E402
+from models.choice import cards_of, choose  # noqa: E402
 from models.errors import AnnotationError  # noqa: E402
 from models.person_detector import PersonBox  # noqa: E402
 from models.training import export  # noqa: E402
@@ -25,7 +26,12 @@ from models.training.finetune import (  # noqa: E402
     finetune,
     split,
 )
-from models.training.network import ConvolutionalPoseMachine, CpmConfig  # noqa: E402
+from models.training.network import (  # noqa: E402
+    ConvolutionalPoseMachine,
+    CpmConfig,
+    PersonConfig,
+    PersonNetwork,
+)
 from models.training.onnx_graph import pose_model  # noqa: E402
 from models.training.users_coco import read_coco  # noqa: E402
 from tests.models import tiny_onnx  # noqa: E402
@@ -85,6 +91,23 @@ def test_human36m_by_the_command_holds_out_whole_clips(
     assert (tmp_path / "out" / "person.onnx").exists(), "the directory can be served"
 
 
+def test_an_exported_person_network_is_the_one_that_is_served(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    config = PersonConfig(width=16, blocks=(1, 1, 1))
+    network = PersonNetwork(config)
+    checkpoint = tmp_path / "last.pt"
+    torch.save({"config": config.as_dict(), "ema": network.state_dict(), "step": 1}, checkpoint)
+    out = tmp_path / "out"
+    arguments = ["export", checkpoint, "--kind", "person", "--version", "1", "--out", out]
+    result = CliRunner().invoke(cli, ["model", *map(str, arguments)])
+    assert result.exit_code == 0, result.exception
+    assert choose(out, "people") == "person"
+    assert read_card(out / "person.json").version == "1"
+    shipped = [card.name for card in cards_of(WEIGHTS_DIR, "pose")]
+    assert [card.name for card in cards_of(out, "pose")] == shipped
+    assert cards_of(out, "lift")
+
+
 def test_a_run_goes_on_with_what_it_began_with_only(start: Path, tmp_path: Path) -> None:
     """Whom another seed holds out may have been trained on: the figures would flatter."""
     records = user_files.coco(tmp_path / "images", 24)
@@ -115,6 +138,28 @@ def test_a_network_of_another_architecture_is_refused(tmp_path: Path) -> None:
             [],
             weights_dir=weights,
             start="foreign",
+            out=tmp_path / "out",
+            name="ours",
+            source="",
+            settings=FinetuneSettings(),
+        )
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"), [("gone", "are missing"), ("cut", r"do not match .*sha256 differs")]
+)
+def test_weights_that_are_not_their_cards_are_refused(
+    start: Path, tmp_path: Path, damage: str, said: str
+) -> None:
+    data = (start / "start.onnx").read_bytes()
+    (start / "start.onnx").unlink()
+    if damage == "cut":
+        (start / "start.onnx").write_bytes(data[: len(data) // 2])
+    with pytest.raises(ModelError, match=rf"start\.onnx {said}"):
+        finetune(
+            [],
+            weights_dir=start,
+            start="start",
             out=tmp_path / "out",
             name="ours",
             source="",

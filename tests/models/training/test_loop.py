@@ -12,6 +12,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from models.errors import ModelError  # noqa: E402
 from models.training import loop  # noqa: E402
 
 
@@ -40,6 +41,40 @@ def test_input_grows_at_its_share_of_the_run_whatever_the_evaluations(tmp_path: 
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert [(line["step"], line["size_px"]) for line in lines] == [(7, 8), (20, 16)]
     assert threading.active_count() == threads
+
+
+def test_a_run_whose_loss_is_no_number_stops_and_goes_on_from_before(tmp_path: Path) -> None:
+    parser = argparse.ArgumentParser()
+    loop.add_arguments(parser)
+    options = "--steps 6 --every 2 --batch 4 --threads 1 --optimizer adamw --device cpu"
+    args = parser.parse_args(["--data", "x", "--out", str(tmp_path), *options.split()])
+
+    def run(spoiled: int) -> None:
+        steps = iter(range(6))
+
+        def loss_of(model: Any, batch: loop.Batch) -> Any:
+            factor = float("nan") if next(steps) == spoiled else 1.0
+            return factor * model(batch[0]).pow(2).mean()
+
+        loop.fit(
+            torch.nn.Conv2d(3, 4, 3),
+            args,
+            sizes=[(1.0, 8)],
+            make_batch=lambda _, size: (torch.ones(4, 3, size, size),),
+            loss_of=loss_of,
+            evaluate=lambda _, __: {},
+            config={},
+        )
+
+    threads = threading.active_count()
+    with pytest.raises(ModelError, match=r"loss of step 3 is nan: .*--lr"):
+        run(spoiled=3)
+    assert threading.active_count() == threads
+    kept = loop.read_checkpoint(tmp_path / "last.pt")
+    assert kept["step"] == 2
+    assert all(torch.isfinite(value).all() for value in kept["model"].values())
+    run(spoiled=-1)
+    assert loop.read_checkpoint(tmp_path / "last.pt")["step"] == 6
 
 
 def test_what_is_added_to_a_network_may_be_new_to_it(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ torch = pytest.importorskip("torch")
 from torch import Tensor  # noqa: E402
 
 from library_store.skeleton import LSP14  # noqa: E402
+from models.training.network import ConvolutionalPoseMachine, CpmConfig  # noqa: E402
 from models.training.objective import (  # noqa: E402
     DEPTH_WEIGHT,
     LEFT,
@@ -55,6 +56,19 @@ def test_exchanged_sides_cost_most_and_no_more_than_two() -> None:
     assert right < 0.1
     assert undecided == pytest.approx(1.0)
     assert 1.9 < wrong <= surer <= 2.0
+
+
+def test_the_loss_is_reckoned_where_the_network_lies() -> None:
+    """On a device without values, which refuses to mix with the CPU as GPUs do."""
+    network = ConvolutionalPoseMachine(
+        CpmConfig(width=8, blocks=(1, 1, 1, 1), stage_width=8, n_stages=2, depths=True)
+    ).to("meta")
+    joints, trust = (part.to("meta") for part in people(2))
+    seen = network.seen(torch.zeros(2, 3, SIZE, SIZE, device="meta"))
+    assert seen.depths is not None
+    loss = total_loss(seen.stages, joints, trust, trust, SIZE)
+    (loss + depth_loss(seen.depths, trust, trust)).backward()
+    assert loss.device.type == "meta"
 
 
 def test_pairs_without_labels_or_in_one_place_have_no_sides() -> None:

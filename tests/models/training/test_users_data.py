@@ -123,10 +123,38 @@ def test_phone_photos_labelled_upright_are_read_upright(tmp_path: Path) -> None:
         assert np.abs(ours.image.astype(int) - turned).mean() < 14
 
 
-def test_a_file_under_two_ids_is_one_image(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("orientation", "size"),
+    [(3, {"width": 320, "height": 240}), (6, {}), (6, {"width": 0, "height": 0})],
+    ids=["half a turn", "no size", "size unknown"],
+)
+def test_a_turned_photo_that_may_be_labelled_either_way_is_refused(
+    tmp_path: Path, orientation: int, size: dict[str, int]
+) -> None:
+    """Else people who were labelled upright would be learned upside down."""
+    records = user_files.coco(tmp_path / "images", 1)
+    image = cv2.imread(str(tmp_path / "images" / "0.png"))
+    assert image is not None
+    _, jpeg = cv2.imencode(".jpg", image)
+    photo = tmp_path / "images" / "0.jpg"
+    records["images"] = [{"id": 0, "file_name": "0.jpg"} | size]
+    path = user_files.write(tmp_path / "labels.json", records)
+    photo.write_bytes(with_exif(jpeg.tobytes(), tiff(orientation)))
+    with pytest.raises(
+        AnnotationError, match=r"0\.jpg is to be turned .* its size fits either way"
+    ):
+        read_coco(path, tmp_path / "images")
+    photo.write_bytes(with_exif(jpeg.tobytes(), tiff(1)))
+    assert len(read_coco(path, tmp_path / "images")) == 2
+
+
+@pytest.mark.parametrize("name", ["1.png", "again/1.png"])
+def test_a_photo_under_two_ids_is_one_image(tmp_path: Path, name: str) -> None:
     """As in merged sets: else one may be held out and the other trained on."""
     records = user_files.coco(tmp_path / "images", 2)
-    records["images"].append(dict(records["images"][1], id=50))
+    (tmp_path / "images" / "again").mkdir()
+    shutil.copy(tmp_path / "images" / "1.png", tmp_path / "images" / "again" / "1.png")
+    records["images"].append(dict(records["images"][1], id=50, file_name=name))
     records["annotations"].append(records["annotations"][0] | {"id": 99, "image_id": 50})
     path = user_files.write(tmp_path / "labels.json", records)
     assert [crop.group for crop in read_coco(path, tmp_path / "images")] == [0, 0, 1, 1, 1]
@@ -212,9 +240,10 @@ def test_a_file_that_is_no_json_or_not_there(tmp_path: Path) -> None:
         read_coco(tmp_path / "none.json", tmp_path)
 
 
-def test_a_picture_that_cannot_be_decoded(tmp_path: Path) -> None:
+@pytest.mark.parametrize("data", [b"oops", b""])
+def test_a_picture_that_cannot_be_decoded(tmp_path: Path, data: bytes) -> None:
     records = user_files.coco(tmp_path / "images")
-    (tmp_path / "images" / "1.png").write_bytes(b"oops")
+    (tmp_path / "images" / "1.png").write_bytes(data)
     with pytest.raises(AnnotationError, match=r"1\.png is no image"):
         read_coco(user_files.write(tmp_path / "labels.json", records), tmp_path / "images")
 
@@ -286,11 +315,18 @@ def test_human36m_that_is_not_whole_is_refused(human36m: Path) -> None:
         with pytest.raises(AnnotationError, match="in a folder S9"):
             read_human36m(human36m, subjects)
     folder = human36m / "S1" / "MyPoseFeatures" / "D2_Positions"
-    np.savez(folder / "Sitting.npz", Pose=np.zeros((5, 96)))
     video = human36m / "S1" / "Videos" / "Walking 1.54138969.mp4"
     video.with_name("Sitting.mp4").write_bytes(video.read_bytes())
-    with pytest.raises(AnnotationError, match=r"wanted is \(F, 64\)"):
-        read_human36m(human36m)
+    # 3D; 17 joints, which have the numbers of 17 frames of 32; one number.
+    for others in ((5, 96), (32, 17, 2), ()):
+        np.savez(folder / "Sitting.npz", Pose=np.zeros(others))
+        with pytest.raises(AnnotationError, match=r"wanted is \(F, 64\)"):
+            read_human36m(human36m)
+    whole = (folder / "Sitting.npz").read_bytes()
+    for damaged in (b"", whole[: len(whole) // 2], b"PK\x03\x04"):
+        (folder / "Sitting.npz").write_bytes(damaged)
+        with pytest.raises(AnnotationError, match=r"Sitting\.npz: no array Pose can be read"):
+            read_human36m(human36m)
     np.savez(folder / "Sitting.npz", Pose=np.zeros((500, 64)) + 50)
     with pytest.raises(AnnotationError, match="can be read up to frame 30"):
         read_human36m(human36m)
