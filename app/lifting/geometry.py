@@ -6,9 +6,9 @@ are those of a pinhole of focal length 1 with its principal point at (0, 0): ``x
 A perspective camera sees the same pose differently at the edge of the photo than at its centre,
 while every exemplar was projected near the optical axis; and photos lie on their side, while every
 exemplar stands (``library_store.upright``). So the person is turned onto the axis first, and
-upright if they lean far: the picture that a camera with the same centre, pointed at the person and rolled
-with them, would have taken. There they are lifted, and the answer is turned back. Both steps are
-exact, a rotation about the camera centre.
+upright if they lean far: the picture that a camera with the same centre, pointed at the person and
+rolled with them, would have taken. There they are lifted, and the answer is turned back. Both steps
+are exact, a rotation about the camera centre.
 """
 
 from __future__ import annotations
