@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from app.engine import milvus_of
 from app.settings import load_settings
 from library_store.backends import Backend
-from library_store.cameras import project, sample_cameras
+from library_store.cameras import project, rolled_upright, sample_cameras
 from library_store.library import Library, load
 from library_store.prior import PosePrior
 
@@ -106,7 +106,7 @@ def read_queries(files: list[str], count: int) -> Floats:
     rng = np.random.default_rng(_SEED)
     if not files:
         poses = PosePrior.load().sample(count, rng)
-        points = project(sample_cameras(count, rng), poses)
+        points = project(rolled_upright(sample_cameras(count, rng), poses), poses)
         heights = np.ptp(points[..., 1], axis=1)[:, None, None]
         noisy: Floats = points + rng.normal(size=points.shape) * _NOISE * heights
         return noisy

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from library_store.backends import DESCRIPTORS_FILE, IndexSettings
 from library_store.backends import write_index as write_index_files
-from library_store.cameras import COLUMNS, project, sample_cameras
+from library_store.cameras import COLUMNS, project, rolled_upright, sample_cameras
 from library_store.descriptor import DIMENSIONS, describe
 from library_store.manifest import (
     CONTENT_FILES,
@@ -99,11 +99,12 @@ def write_descriptors(steps: Steps, workshop: Path, seed: int, report: Report) -
             for number, rows in enumerate(slices(n)):
                 # Always a whole chunk, so that a camera does not depend on how many are wanted.
                 drawn = sample_cameras(CHUNK, camera_generator(seed, number))
-                drawn = drawn[: rows.stop - rows.start]
+                seen = poses[pose_of[rows]]
+                drawn = rolled_upright(drawn[: rows.stop - rows.start], seen)
                 cameras.append(drawn)
                 entries = np.arange(rows.start, rows.stop, dtype=np.int32)
                 projections.append(np.column_stack([pose_of[rows], entries]))
-                descriptors.append(describe(project(drawn, poses[pose_of[rows]])))
+                descriptors.append(describe(project(drawn, seen)))
                 report("descriptors", rows.stop / n)
         return {"n_cameras": n}
 

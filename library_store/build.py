@@ -43,7 +43,7 @@ from library_store.steps import Facts, Steps
 Progress = Callable[[str, float], None]
 """Hears the stage's name and the fraction of it that is done."""
 
-RECIPE = 3
+RECIPE = 4
 """Raised whenever the code would build another library from the same parameters."""
 
 BYTES_PER_EXEMPLAR = 620

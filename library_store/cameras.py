@@ -7,12 +7,16 @@ which thereby lies on the optical axis. The exemplar's frame has Y up and the hi
 origin, the camera's has OpenCV's axes (x right, y down, z forward), both are in millimetres:
 
     X_camera = R X_exemplar + t,    t = (0, 0, distance) - R mean(X_exemplar)
+
+A library's cameras are rolled until nobody before them leans far (``library_store.upright``).
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from library_store.upright import turn_rad
 
 Float = NDArray[np.float64]
 
@@ -41,6 +45,14 @@ def sample_cameras(n: int, rng: np.random.Generator) -> NDArray[np.float32]:
     near, far = (limit**-0.5 for limit in DISTANCE_RANGE_MM)
     distance = rng.uniform(far, near, n) ** -2
     return np.stack([azimuth, elevation, roll, distance], axis=-1).astype(np.float32)
+
+
+def rolled_upright(cameras: ArrayLike, poses_mm: ArrayLike) -> NDArray[np.float32]:
+    """Cameras (n, 4), those rolled before whom poses (n, 14, 3) mm lean far: (n, 4)."""
+    table = np.array(cameras, dtype=np.float64)
+    table[:, 2] -= np.degrees(turn_rad(project(table, poses_mm)))
+    table[:, 2] -= 360.0 * np.round(table[:, 2] / 360.0)
+    return table.astype(np.float32)
 
 
 def rotations(cameras: ArrayLike) -> Float:

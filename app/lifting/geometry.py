@@ -1,12 +1,14 @@
-"""Projective geometry of one person: rays, projection, turning the camera onto the person.
+"""Projective geometry of one person: rays, projection, turning the camera to the person.
 
 Camera axes are OpenCV's: x right, y down, z forward; millimetres. *Normalised image coordinates*
 are those of a pinhole of focal length 1 with its principal point at (0, 0): ``x = X / Z``.
 
 A perspective camera sees the same pose differently at the edge of the photo than at its centre,
-while every exemplar was projected near the optical axis. So the person is first turned onto the
-axis (the picture a camera with the same centre, pointed at the person, would have taken), lifted
-there, and the answer turned back. Both steps are exact: a rotation about the camera centre.
+while every exemplar was projected near the optical axis; and photos lie on their side, while every
+exemplar stands (``library_store.upright``). So the person is turned onto the axis first, and
+upright if they lean far: the picture that a camera with the same centre, pointed at the person and
+rolled with them, would have taken. There they are lifted, and the answer is turned back. Both steps
+are exact, a rotation about the camera centre.
 """
 
 from __future__ import annotations
@@ -17,9 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from library_store.upright import turn_rad
+
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
+
+_LEAST_DEPTH = 1e-3
 
 
 def project(points_mm: Floats, focal_length_px: float, principal_point_px: Floats) -> Floats:
@@ -62,9 +68,15 @@ def rotation_onto_axis(direction: Floats) -> Floats:
     )
 
 
+def turned_back(lean: float) -> Floats:
+    """The camera's roll (3, 3) that sets somebody upright who leans by ``lean`` radians."""
+    cos, sin = math.cos(lean), math.sin(lean)
+    return np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
 @dataclass(frozen=True)
 class CentredView:
-    """One person as a camera pointed straight at them would see them.
+    """One person as a camera pointed straight at them would see them, upright if they lean far.
 
     ``rotation`` (3, 3) takes the photo's camera frame to the centred one; ``points`` (14, 2) are
     normalised image coordinates there; ``covariance`` (14, 2, 2) their uncertainty in the same
@@ -87,7 +99,7 @@ def centre_view(
     focal_length_px: float,
     principal_point_px: Floats,
 ) -> CentredView:
-    """Turn the camera onto the weighted centre of a person's joints.
+    """Turn the camera onto the weighted centre of a person's joints; who leans far, upright.
 
     Args:
         joints_px: (J, 2) pixels; rows of weight 0 may hold anything finite.
@@ -107,8 +119,12 @@ def centre_view(
     # Each counts as the unit vector along it.
     rotation = rotation_onto_axis((weights / np.sqrt((rays**2).sum(1))) @ rays)
     turned = rays @ rotation.T
+    lean = float(turn_rad(turned[:, :2] / np.maximum(turned[:, 2:], _LEAST_DEPTH), present))
+    if lean:
+        rotation = turned_back(lean) @ rotation
+        turned = rays @ rotation.T
     # A joint more than 90° from the person's own centre cannot be seen: it would be behind.
-    depth = np.maximum(turned[:, 2:], 1e-3)
+    depth = np.maximum(turned[:, 2:], _LEAST_DEPTH)
     points = np.where(present[:, None], turned[:, :2] / depth, 0.0)
     covariance = None
     if covariance_px2 is not None:

@@ -24,7 +24,7 @@ from library_store.assemble import (
     write_poses,
 )
 from library_store.backends import DESCRIPTORS_FILE, IndexSettings
-from library_store.cameras import COLUMNS, project
+from library_store.cameras import COLUMNS, project, rolled_upright
 from library_store.descriptor import DIMENSIONS, describe
 from library_store.library import Library, load
 from library_store.manifest import Licence
@@ -79,8 +79,8 @@ def orbit_rows(rotation: Floats, distance_mm: Floats) -> NDArray[np.float32]:
 def exemplars_of(views: Views) -> Exemplars:
     """Every view as an exemplar: its pose, and its camera turned onto the person.
 
-    An exemplar's camera looks at the mean of the joints; a view off the axis is turned there, as
-    lifting turns the person it looks at.
+    An exemplar's camera looks at the mean of the joints; a view off the axis is turned there, and
+    upright if the person leans far, as lifting turns whom it looks at.
     """
     key = np.lexsort((views.at, views.camera, views.scene))
     views = views[key]
@@ -116,7 +116,7 @@ def exemplars_of(views: Views) -> Exemplars:
     licences = sorted({views.scenes[scene].clip.licence for scene in scenes} - {""})
     return Exemplars(
         poses,
-        orbit_rows(rotation, distance),
+        rolled_upright(orbit_rows(rotation, distance), poses),
         views.at.astype(np.int32),
         tuple(runs),
         tuple(clips),

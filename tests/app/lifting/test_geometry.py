@@ -8,6 +8,8 @@ from app.lifting.geometry import (
     project,
     rotation_onto_axis,
 )
+from library_store.skeleton import HEAD_TOP, L_HIP, L_SHOULDER, NECK, R_HIP, R_SHOULDER
+from library_store.upright import MOST_LEAN, lean_rad
 
 RNG = np.random.default_rng(0)
 
@@ -38,6 +40,50 @@ def test_centred_view_is_what_a_turned_camera_sees() -> None:
     np.testing.assert_allclose(normalised_projection(turned), view.points, atol=1e-12)
     np.testing.assert_allclose(view.to_photo(turned), points, atol=1e-9)
     assert np.abs(view.points.mean(0)).max() < 0.03
+
+
+def standing() -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """(14, 2) pixels, y down."""
+    points = RNG.normal(size=(14, 2)) * 60
+    points[[HEAD_TOP, NECK, R_SHOULDER, L_SHOULDER]] = [
+        [2, -170],
+        [0, -120],
+        [-40, -100],
+        [40, -99],
+    ]
+    points[[R_HIP, L_HIP]] = [[-25, 0], [25, 1]]
+    return points
+
+
+def leaning(
+    points: np.ndarray[tuple[int, int], np.dtype[np.float64]], angle: float
+) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned: np.ndarray[tuple[int, int], np.dtype[np.float64]] = points @ [[cos, sin], [-sin, cos]]
+    return turned
+
+
+def test_who_lies_is_seen_upright_whatever_the_cameras_roll() -> None:
+    person, weights, origin = standing(), np.ones(14), np.zeros(2)
+    upright = centre_view(person, weights, None, 800.0, origin)
+    covariance = np.broadcast_to(np.diag([4.0, 1.0]), (14, 2, 2))
+    for angle in (0.7, -1.6, 3.1):
+        lying = leaning(person, angle)
+        view = centre_view(lying, weights, covariance, 800.0, origin)
+        assert lean_rad(view.points, weights > 0) == pytest.approx(0.0, abs=0.01)
+        again = centre_view(leaning(lying, 1.0), weights, None, 800.0, origin)
+        if abs(np.angle(np.exp(1j * (angle + 1.0)))) > MOST_LEAN:
+            np.testing.assert_allclose(again.points, view.points, atol=1e-9)
+        np.testing.assert_allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(view.rotation) == pytest.approx(1.0)
+        # What was uncertain along the photo's rows is so along what they have become.
+        assert view.covariance is not None
+        row = view.rotation[:2, 0] / np.linalg.norm(view.rotation[:2, 0])
+        ratio = (row @ view.covariance[0] @ row) / np.trace(view.covariance[0])
+        assert ratio == pytest.approx(0.8, abs=0.03)
+    slightly = centre_view(leaning(person, 0.9 * MOST_LEAN), weights, None, 800.0, origin)
+    assert abs(lean_rad(slightly.points, weights > 0)) > 0.8 * MOST_LEAN
+    assert np.abs(upright.points - slightly.points).max() > 0.01
 
 
 def test_missing_joints_do_not_move_the_view() -> None:

@@ -161,6 +161,27 @@ def test_twenty_degrees_off_axis_costs_nothing(lifter: Lifter, people: People) -
     assert abs(errors[1] - errors[0]) < 2.0
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_photo_on_its_side_costs_nothing(lifter: Lifter, people: People, method: Method) -> None:
+    """Whoever leans far is turned upright first: then any further turn of the photo is undone."""
+    centre = np.array(INTRINSICS.principal_point_px)
+    quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    for i in range(4):
+        pixels = (people.joints_px[i] - centre) @ quarter + centre
+        person = lift_one(lifter, observe(pixels), method=method)
+        half = (people.joints_px[i] - centre) @ quarter @ quarter + centre
+        other = lift_one(lifter, observe(half), method=method)
+        turned = other.joints_3d_mm.copy()
+        turned[:, :2] = turned[:, :2] @ quarter.T
+        np.testing.assert_allclose(turned, person.joints_3d_mm, atol=1e-6)
+        placed = other.exemplar.joints_mm.copy()
+        placed[:, :2] = placed[:, :2] @ quarter.T
+        np.testing.assert_allclose(placed, person.exemplar.joints_mm, atol=1e-6)
+        assert other.exemplar.reprojection_error_px == pytest.approx(
+            person.exemplar.reprojection_error_px
+        )
+
+
 def test_a_mirrored_person_gives_about_the_mirrored_pose(lifter: Lifter, people: People) -> None:
     mirror = list(LSP14.mirror)
     differences = []
