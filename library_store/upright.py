@@ -53,3 +53,11 @@ def turn_rad(points: ArrayLike, present: ArrayLike | None = None) -> Float:
     """
     lean = lean_rad(points, present)
     return np.where(np.abs(lean) > MOST_LEAN, lean, 0.0)
+
+
+def rotations_by(turn: ArrayLike) -> Float:
+    """The camera's rolls (..., 3, 3) by which what it sees is turned so far, x right and y down."""
+    angle = np.asarray(turn, dtype=np.float64)
+    cos, sin, zero = np.cos(angle), np.sin(angle), np.zeros_like(angle)
+    rows = [cos, sin, zero, -sin, cos, zero, zero, zero, zero + 1.0]
+    return np.stack(rows, axis=-1).reshape(*angle.shape, 3, 3)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from library_store.upright import turn_rad
+from library_store.upright import rotations_by, turn_rad
 
 Floats = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
@@ -68,12 +68,6 @@ def rotation_onto_axis(direction: Floats) -> Floats:
     )
 
 
-def turned_back(lean: float) -> Floats:
-    """The camera's roll (3, 3) that sets somebody upright who leans by ``lean`` radians."""
-    cos, sin = math.cos(lean), math.sin(lean)
-    return np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-
-
 @dataclass(frozen=True)
 class CentredView:
     """One person as a camera pointed straight at them would see them, upright if they lean far.
@@ -119,9 +113,9 @@ def centre_view(
     # Each counts as the unit vector along it.
     rotation = rotation_onto_axis((weights / np.sqrt((rays**2).sum(1))) @ rays)
     turned = rays @ rotation.T
-    lean = float(turn_rad(turned[:, :2] / np.maximum(turned[:, 2:], _LEAST_DEPTH), present))
-    if lean:
-        rotation = turned_back(lean) @ rotation
+    turn = turn_rad(turned[:, :2] / np.maximum(turned[:, 2:], _LEAST_DEPTH), present)
+    if turn:
+        rotation = rotations_by(turn) @ rotation
         turned = rays @ rotation.T
     # A joint more than 90° from the person's own centre cannot be seen: it would be behind.
     depth = np.maximum(turned[:, 2:], _LEAST_DEPTH)

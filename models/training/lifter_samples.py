@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from library_store.cameras import rotations, sample_cameras
 from library_store.proportions import resize
 from library_store.skeleton import L_HIP, LIMB_JOINTS, LSP14, R_HIP
+from library_store.upright import rotations_by, turn_rad
 
 Floats = NDArray[np.float32]
 
@@ -162,7 +163,7 @@ def _present(n: int, rng: np.random.Generator) -> Floats:
 
 
 def _onto_axis(points: Floats, present: Floats) -> tuple[Floats, Floats]:
-    """The camera turned onto the joints that are there: rotations (n, 3, 3), and the rays.
+    """The camera turned onto the joints that are there, and upright: rotations (n, 3, 3); the rays.
 
     A ray or point v becomes v @ rotation; what the service does before it lifts anybody.
     """
@@ -172,7 +173,11 @@ def _onto_axis(points: Floats, present: Floats) -> tuple[Floats, Floats]:
     x, y, z = (middle / np.linalg.norm(middle, axis=1, keepdims=True)).T
     s = 1.0 / (1.0 + z)
     rows = [1 - s * x * x, -s * x * y, x, -s * x * y, 1 - s * y * y, y, -x, -y, z]
-    return np.stack(rows, 1).reshape(-1, 3, 3).astype(np.float32), rays
+    onto_axis = np.stack(rows, 1).reshape(-1, 3, 3)
+    turned = rays @ onto_axis
+    turn = turn_rad(turned[..., :2] / turned[..., 2:], present > 0)
+    rotation: Floats = (onto_axis @ rotations_by(turn).swapaxes(1, 2)).astype(np.float32)
+    return rotation, rays
 
 
 def _root_depth(joints: Floats) -> Floats:

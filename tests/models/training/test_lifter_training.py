@@ -16,6 +16,7 @@ from torch import Tensor  # noqa: E402
 
 from library_store.prior import PosePrior  # noqa: E402
 from library_store.skeleton import LSP14  # noqa: E402
+from library_store.upright import MOST_LEAN, lean_rad  # noqa: E402
 from models import ModelError, PoseLifter  # noqa: E402
 from models.card import WEIGHTS_DIR, LiftOutput, read_card  # noqa: E402
 from models.training import lifter_samples, train_lifter  # noqa: E402
@@ -106,6 +107,16 @@ def test_samples_without_noise_are_where_they_are(
     np.testing.assert_allclose(middle[:, :2] / middle[:, 2:], 0.0, atol=1e-4)
     hips = samples.depths[:, [8, 11]].mean(1)
     np.testing.assert_allclose(hips, 0.0, atol=1e-5)
+
+
+def test_nobody_leans_farther_than_the_service_lets_them(poses: Floats) -> None:
+    lying = poses @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], np.float32)
+    samples = draw(np.concatenate([poses, lying]), 500, np.random.default_rng(0))
+    lean = np.abs(lean_rad(samples.points, samples.present > 0))
+    assert lean.max() < MOST_LEAN + 1e-4
+    assert 0.2 < (lean < 1e-4).mean() < 0.8
+    upright = samples.truth[:, 1, 1] < samples.truth[:, [8, 11], 1].mean(1)
+    assert upright.mean() > 0.95, "the truth is turned with what is seen"
 
 
 @pytest.mark.parametrize("reads_depths", [False, True])
