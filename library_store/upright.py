@@ -10,12 +10,26 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from library_store.skeleton import HEAD_TOP, L_HIP, L_SHOULDER, NECK, R_HIP, R_SHOULDER
+from library_store.skeleton import HEAD_TOP, L_HIP, L_SHOULDER, LSP14, NECK, R_HIP, R_SHOULDER
 
 Float = NDArray[np.float64]
 
 MOST_LEAN = np.radians(30.0)
 """Who leans more than this is turned. Who leans less stays: how somebody leans tells their pose."""
+
+
+def _upwards() -> Float:
+    """Vectors that point up in somebody upright, (4, 14): a joint's share in each."""
+    vectors = np.zeros((4, LSP14.n_joints))
+    vectors[[0, 1], [R_SHOULDER, L_SHOULDER]] = 1.0
+    vectors[[0, 1], [R_HIP, L_HIP]] = -1.0
+    vectors[[2, 3], [NECK, HEAD_TOP]] = 1.0
+    vectors[2:, [R_HIP, L_HIP]] = -0.5
+    return vectors
+
+
+_UPWARDS = _upwards()
+_NEEDED = (_UPWARDS != 0).astype(np.float64)
 
 
 def lean_rad(points: ArrayLike, present: ArrayLike | None = None) -> Float:
@@ -33,17 +47,13 @@ def lean_rad(points: ArrayLike, present: ArrayLike | None = None) -> Float:
 
     """
     at = np.asarray(points, dtype=np.float64)
-    there = np.ones(at.shape[:-1], dtype=bool) if present is None else np.asarray(present)
-    hips = there[..., R_HIP] & there[..., L_HIP]
-    middle = 0.5 * (at[..., R_HIP, :] + at[..., L_HIP, :])
-    up = np.zeros((*at.shape[:-2], 2))
-    for shoulder, hip in ((R_SHOULDER, R_HIP), (L_SHOULDER, L_HIP)):
-        both = there[..., shoulder] & there[..., hip]
-        up += both[..., None] * (at[..., shoulder, :] - at[..., hip, :])
-    for joint in (NECK, HEAD_TOP):
-        up += (hips & there[..., joint])[..., None] * (at[..., joint, :] - middle)
-    lean: Float = np.arctan2(up[..., 0], -up[..., 1])
-    return np.where((up == 0).all(-1), 0.0, lean)
+    if present is None:
+        shares = _UPWARDS.sum(0)
+    else:
+        shares = (np.asarray(present) @ _NEEDED.T == _NEEDED.sum(1)) @ _UPWARDS
+    up = np.einsum("...j,...jc->...c", shares, at)
+    lean: Float = np.arctan2(up[..., 0], 0.0 - up[..., 1])
+    return lean
 
 
 def turn_rad(points: ArrayLike, present: ArrayLike | None = None) -> Float:
