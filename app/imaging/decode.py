@@ -92,6 +92,8 @@ def decode_photo(
     header = read_header(data)
     if header.width_px * header.height_px > max_pixels:
         raise TooManyPixelsError(header.width_px, header.height_px, max_pixels)
+    if header.deflated is not None:
+        header.deflated.check(data)
     exif = read_exif(header.exif)
     long_side, wanted = max(header.width_px, header.height_px), side_px
     if box_px is not None:

@@ -29,6 +29,11 @@ _PNG_NEEDED = frozenset({b"tRNS", b"acTL", b"fcTL", b"fdAT"})
 to 8 MB at most, and complains of each that it does not like."""
 _JPEG_NOT_FILL = re.compile(rb"[^\xff]")
 _JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
+_PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+_PNG_UNCHECKED = 1_000_000
+"""Compressed bytes of pixels that are not inflated to see how many they are: libpng would inflate
+whatever follows the last row too, a thousand bytes from each."""
+_PNG_PIECE = 1 << 20
 _TEXT = re.compile(rb"[\t-\r\x1b -~]+")
 _ISO_BRANDS = {
     b"hevc": "a HEIF sequence",
@@ -52,12 +57,36 @@ _OTHER_MAGICS = (
 
 
 @dataclass(frozen=True)
+class Deflated:
+    """Pixels as a zlib stream, in pieces from and to, of ``most`` bytes at the utmost."""
+
+    media_type: str
+    spans: tuple[tuple[int, int], ...]
+    most: int
+
+    def check(self, data: bytes) -> None:
+        """Raise ``UndecodableImageError`` where more follows, which a decoder would inflate."""
+        inflater, n = zlib.decompressobj(), 0
+        for start, end in self.spans:
+            left = data[start:end]
+            while left and not inflater.eof:
+                try:
+                    n += len(inflater.decompress(left, _PNG_PIECE))
+                except zlib.error:
+                    return  # the decoder ends there too, and says so
+                if n > self.most:
+                    _corrupt(self.media_type, "more data than its pixels take follows them")
+                left = inflater.unconsumed_tail
+
+
+@dataclass(frozen=True)
 class ImageHeader:
     """What the container says of its image.
 
     ``width_px`` and ``height_px`` are those stored, before any EXIF orientation; ``exif`` is the
     TIFF block of the EXIF data; ``has_alpha`` says that some pixels may be transparent.
-    ``needless`` are the bytes, from and to, that a decoder would only lose time on.
+    ``needless`` are the bytes, from and to, that a decoder would only lose time on; ``deflated``
+    pixels are to be checked before they are decoded.
     """
 
     media_type: str
@@ -66,6 +95,7 @@ class ImageHeader:
     exif: bytes | None
     has_alpha: bool
     needless: tuple[tuple[int, int], ...] = ()
+    deflated: Deflated | None = None
 
 
 def accepted_types() -> tuple[str, ...]:
@@ -165,7 +195,9 @@ def _read_png(data: bytes) -> ImageHeader:
     kind = "image/png"
     size: tuple[int, int] | None = None
     exif: bytes | None = None
-    has_alpha = has_data = False
+    has_alpha = False
+    row_bits = 0
+    pixels: list[tuple[int, int]] = []
     needless: list[tuple[int, int]] = []
     position = len(_PNG_MAGIC)
     for _ in range(_MAX_PIECES):
@@ -182,6 +214,7 @@ def _read_png(data: bytes) -> ImageHeader:
                 _corrupt(kind, "it does not start with its header")
             size = int.from_bytes(body[:4], "big"), int.from_bytes(body[4:8], "big")
             has_alpha = body[9] in {4, 6}
+            row_bits = size[0] * body[8] * _PNG_CHANNELS.get(body[9], 0)
         elif name == b"IHDR":
             _corrupt(kind, "it has two headers")
         elif name == b"tRNS":
@@ -189,7 +222,7 @@ def _read_png(data: bytes) -> ImageHeader:
         elif name == b"eXIf":
             exif = bytes(body)
         elif name == b"IDAT":
-            has_data = True
+            pixels.append((position + 8, end - 4))
         elif name == b"IEND":
             break
         if name[:1].islower() and name not in _PNG_NEEDED:
@@ -197,9 +230,16 @@ def _read_png(data: bytes) -> ImageHeader:
         position = end
     else:
         _corrupt(kind, "it has too many chunks")
-    if size is None or not has_data:
+    if size is None or not pixels:
         _corrupt(kind, "it holds no image")
-    return ImageHeader(kind, size[0], size[1], exif, has_alpha, needless=tuple(needless))
+    # Interlaced, an image has more rows, and bytes for their filters and ends.
+    most = size[1] * (row_bits // 8 + 16) + _PNG_PIECE
+    deflated = Deflated(kind, tuple(pixels), most) if _is_much(pixels) else None
+    return ImageHeader(kind, size[0], size[1], exif, has_alpha, tuple(needless), deflated)
+
+
+def _is_much(spans: list[tuple[int, int]]) -> bool:
+    return sum(end - start for start, end in spans) > _PNG_UNCHECKED
 
 
 def _read_webp(data: bytes) -> ImageHeader:

@@ -229,6 +229,32 @@ def test_what_a_png_says_beside_its_pixels_is_not_inflated(
     assert capfd.readouterr().err == ""
 
 
+def test_pngs_whose_pixels_are_followed_by_more_are_refused() -> None:
+    """libpng inflates all of it: a file of 15 MB would take it half a minute."""
+    noise = np.random.default_rng(0).integers(0, 256, (700, 701, 3)).astype(np.uint8)
+    png = encode(noise, ".png")
+    assert len(png) > 1_400_000
+    rows = zlib.decompress(b"".join(png_bodies(png, b"IDAT")))
+
+    def made(pixels: bytes) -> bytes:
+        end = png_chunk(b"IDAT", zlib.compress(pixels, 1)) + png_chunk(b"IEND", b"")
+        return png[:33] + end
+
+    assert np.array_equal(decode(made(rows)).pixels_bgr, noise)
+    with pytest.raises(UndecodableImageError, match="more data than its pixels take"):
+        decode(made(rows + bytes(50_000_000)))
+
+
+def png_bodies(png: bytes, name: bytes) -> list[bytes]:
+    found, position = [], 8
+    while position < len(png):
+        length = int.from_bytes(png[position : position + 4], "big")
+        if png[position + 4 : position + 8] == name:
+            found.append(png[position + 8 : position + 8 + length])
+        position += 12 + length
+    return found
+
+
 def test_bytes_after_the_end_are_ignored() -> None:
     for extension in (".jpg", ".png", ".webp"):
         decode(encode(scene(), extension) + b"<script>GIF89a\xff\xd8")
