@@ -195,6 +195,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(report("without doubts, other half", other, alone))
     print(report("fitted half", fitted, calibration))
     print(report("other half", other, calibration))
+    print(report("other half, as served", other, FUSION_SIGMA))
 
 
 if __name__ == "__main__":
