@@ -80,7 +80,7 @@ def test_the_command_measures_photos_with_truth(
     photo_sigma.main(command)
     printed = capsys.readouterr().out
     assert f"{people} people, {people} lifted" in printed
-    assert printed.count("\n| ") == 4
+    assert printed.count("\n| ") == 5
 
     write_set(photos, with_3d=False)
     with pytest.raises(SystemExit, match="no 3D truth"):
