@@ -132,6 +132,17 @@ def test_missing_joints_are_less_sure_and_matter_little_to_others(
     assert np.delete(moved, [4, 10]).mean() < 60.0
 
 
+def test_of_portraits_it_is_not_asked(lifter: Lifter, both: Lifter, people: People) -> None:
+    """It has learned of too few people without anything from the hips down to be of use there."""
+    portrait = observe(people.joints_px[0], missing=(8, 9, 10, 11, 12, 13))
+    np.testing.assert_array_equal(
+        lift_one(both, portrait).joints_3d_mm, lift_one(lifter, portrait).joints_3d_mm
+    )
+    cut = observe(people.joints_px[0], missing=(8, 10, 11, 12, 13))
+    apart = lift_one(both, cut).joints_3d_mm - lift_one(lifter, cut).joints_3d_mm
+    assert np.abs(apart).max() > 1.0
+
+
 def test_the_papers_method_does_not_ask_it(lifter: Lifter, both: Lifter, people: People) -> None:
     answers = [
         lift_one(one, people.observation(1), method="paper").joints_3d_mm for one in (lifter, both)
