@@ -113,13 +113,15 @@ def usual(looks: int) -> float:
     return 1 + sum(look.share for look in FURTHER[: looks - 1])
 
 
-def looked_at(see: Callable[[Images], Seen], images: Images, looks: int) -> Seen:
+def looked_at(
+    see: Callable[[Images], Seen], images: Images, looks: int, first: Seen | None = None
+) -> Seen:
     """What the network ``see`` makes of crops (N, S, S, 3) in up to ``looks``: logits, depths.
 
-    Cells that a further look does not see keep what the earlier ones say. What a look shows smaller
-    is shallower in it too.
+    ``first``: what it made of them already. Cells that a further look does not see keep what the
+    earlier ones say. What a look shows smaller is shallower in it too.
     """
-    first = see(images)
+    first = see(images) if first is None else first
     maps, depths = first.maps, first.depths
     size, cells = images.shape[1], maps.shape[-1]
     for before, look in enumerate(FURTHER[: looks - 1], 1):

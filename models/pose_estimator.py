@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +14,24 @@ from models.card import WEIGHTS_DIR, ModelCard, PoseOutput
 from models.crop import square_crop
 from models.errors import ModelError
 from models.heatmaps import Floats, Joints2D, Maps, calibrated, read_maps
-from models.looks import Seen, looked_at
+from models.looks import Seen, belief, looked_at
 from models.person_detector import PersonBox
 from models.providers import ProviderChoice, Runtime
 from models.rivals import shares
 from models.session import OnnxModel
+from models.truncation import whole
+
+
+class _Crop(NamedTuple):
+    """A square of a photo, its pixels' size there, and where its pixel (0, 0) lies."""
+
+    image: NDArray[np.uint8]
+    scale: float
+    origin_px: tuple[float, float]
+
+
+def _images(crops: Sequence[_Crop]) -> NDArray[np.uint8]:
+    return np.stack([crop.image for crop in crops])
 
 
 class PoseEstimator:
@@ -62,17 +76,48 @@ class PoseEstimator:
         """Joints of the person in each box of a photo (H, W, 3) uint8 BGR, one batch for all."""
         if not boxes:
             return []
-        size = self._output.input_px
-        crops, scales, origins = [], [], []
-        for box in boxes:
-            center = (box.x_px + box.width_px / 2, box.y_px + box.height_px / 2)
-            side = max(box.width_px, box.height_px, 1.0) * self._output.crop_scale
-            crop, scale, origin = square_crop(image, center, side, size, self._output.border_grey)
-            crops.append(crop)
-            scales.append(scale)
-            origins.append(origin)
-        seen = looked_at(self._model.see, np.stack(crops), self._output.looks)
-        return self.read(seen, scales, origins)
+        crops = [self._crop(image, box) for box in boxes]
+        first = self._model.see(_images(crops))
+        first = self._seen_whole(image, boxes, crops, first)
+        seen = looked_at(self._model.see, _images(crops), self._output.looks, first)
+        return self.read(seen, [it.scale for it in crops], [it.origin_px for it in crops])
+
+    def _crop(self, image: NDArray[np.uint8], box: PersonBox) -> _Crop:
+        center = (box.x_px + box.width_px / 2, box.y_px + box.height_px / 2)
+        side = max(box.width_px, box.height_px, 1.0) * self._output.crop_scale
+        size, grey = self._output.input_px, self._output.border_grey
+        return _Crop(*square_crop(image, center, side, size, grey))
+
+    def _seen_whole(
+        self,
+        image: NDArray[np.uint8],
+        boxes: Sequence[PersonBox],
+        crops: list[_Crop],
+        first: Seen,
+    ) -> Seen:
+        """The first look, of who seems to be cut off at the scale of the whole person.
+
+        Replaces crops of those whom the network believes in more then.
+        """
+        height, width = image.shape[:2]
+        believed = belief(first.maps)
+        larger = {}
+        for i, box in enumerate(boxes):
+            grown = whole(box, width, height, float(believed[i]))
+            if grown is not None:
+                larger[i] = self._crop(image, grown)
+        if not larger:
+            return first
+        again = self._model.see(_images(list(larger.values())))
+        better = belief(again.maps) > believed[list(larger)]
+        maps = first.maps.copy()
+        depths = None if first.depths is None else first.depths.copy()
+        for row, (i, crop) in enumerate(larger.items()):
+            if better[row]:
+                crops[i], maps[i] = crop, again.maps[row]
+                if depths is not None and again.depths is not None:
+                    depths[i] = again.depths[row]
+        return Seen(maps, depths)
 
     def read(
         self, seen: Seen, scales: Sequence[float], origins: Sequence[tuple[float, float]]

@@ -1,0 +1,52 @@
+"""People whom the photo's edge cuts off: a box of what is seen, and how large the person would be.
+
+The pose network knows people who fill its crop. Of a portrait the box holds head, shoulders and
+arms, twice as large as the network ever saw them: it finds half of them. The less it believes, the
+more of the person is missing, and the more the box must grow beyond the edge.
+"""
+
+from __future__ import annotations
+
+from models.person_detector import PersonBox
+
+NEAR_EDGE = 0.25
+"""Of the box's longer side: so far from the photo's edge a box may end that is cut off there. The
+last joint to be seen lies well within, a hip of somebody cut off at the thighs."""
+GROWTHS = ((0.12, 2.2), (0.26, 1.8), (0.36, 1.4))
+"""What the mean belief in all joints (``models.looks.belief``) lies under, and how much longer the
+whole person is: cut off at the waist, at the hips or thighs, at the knees (docs/experiments.md)."""
+
+
+def whole(box: PersonBox, width_px: int, height_px: int, belief: float) -> PersonBox | None:
+    """The box as the whole person would have it, if the photo's edge seems to cut them off.
+
+    It grows downwards, where photos end most often; else upwards; else, if it is wider than tall,
+    to the one side that it lies at.
+
+    Args:
+        box: what is seen of the person, pixels of the photo.
+        width_px: of the photo.
+        height_px: of the photo.
+        belief: how far the network believed in the joints it found in ``box``, 0 to 1.
+
+    Returns:
+        The larger box, or None for who is seen clearly, or ends within the photo.
+
+    """
+    growth = next((longer for least, longer in GROWTHS if belief < least), None)
+    if growth is None:
+        return None
+    near = NEAR_EDGE * max(box.width_px, box.height_px)
+    left, top = box.x_px < near, box.y_px < near
+    right = box.x_px + box.width_px > width_px - near
+    bottom = box.y_px + box.height_px > height_px - near
+    x, y, width, height = box.x_px, box.y_px, box.width_px, box.height_px
+    if bottom or top:
+        height *= growth
+        y = y if bottom else y + box.height_px - height
+    elif left != right and width > height:
+        width *= growth
+        x = x if right else x + box.width_px - width
+    else:
+        return None
+    return PersonBox(x, y, width, height, box.score)
