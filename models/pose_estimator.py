@@ -19,7 +19,7 @@ from models.person_detector import PersonBox
 from models.providers import ProviderChoice, Runtime
 from models.rivals import shares
 from models.session import OnnxModel
-from models.truncation import whole
+from models.truncation import PLAINLY, whole
 
 
 class _Crop(NamedTuple):
@@ -97,7 +97,7 @@ class PoseEstimator:
     ) -> Seen:
         """The first look, of who seems to be cut off at the scale of the whole person.
 
-        Replaces crops of those whom the network believes in more then.
+        Replaces crops of those whom the network plainly believes in more then.
         """
         height, width = image.shape[:2]
         believed = belief(first.maps)
@@ -109,7 +109,7 @@ class PoseEstimator:
         if not larger:
             return first
         again = self._model.see(_images(list(larger.values())))
-        better = belief(again.maps) > believed[list(larger)]
+        better = belief(again.maps) > PLAINLY * believed[list(larger)]
         maps = first.maps.copy()
         depths = None if first.depths is None else first.depths.copy()
         for row, (i, crop) in enumerate(larger.items()):

@@ -16,6 +16,10 @@ GROWTHS = ((0.12, 2.2), (0.26, 1.8), (0.36, 1.4))
 """What the mean belief in all joints (``models.looks.belief``) lies under, and how much longer the
 whole person is: cut off at the waist, at the hips or thighs, at the knees (docs/experiments.md)."""
 
+PLAINLY = 1.2
+"""How many times as much must be believed of the whole person: of who ends near the edge, but is
+not cut off, the larger view is believed in a little more now and then, and read worse."""
+
 
 def whole(box: PersonBox, width_px: int, height_px: int, belief: float) -> PersonBox | None:
     """The box as the whole person would have it, if the photo's edge seems to cut them off.
