@@ -16,13 +16,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from library_store.skeleton import LSP14
+from library_store.skeleton import LIMB_JOINTS, LSP14
 from models.card import WEIGHTS_DIR, LiftOutput, ModelCard, read_card
 from models.errors import ModelError
 from models.providers import Runtime
 from models.session import OnnxModel
 
 Floats = NDArray[np.float64]
+
+_LIMBS = np.array(LIMB_JOINTS)
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ class PoseLifter:
 
     Joints that are stated are noisy at worst, those that a pose network found are now and then
     elsewhere: what is best to make of the one is not of the other. So a card may name a second
-    network, ``found``, for people not all of whose joints are sure.
+    network, ``found``, for people not all of whose limb joints are sure. (Neck and head top may be
+    guesses from other skeletons' joints that are.)
     """
 
     def __init__(self, name: str = "lifter", *, weights_dir: Path = WEIGHTS_DIR) -> None:
@@ -100,7 +103,8 @@ class PoseLifter:
                 networks that do not read them.
 
         """
-        if self._found is not None and ((confidence > 0) & (confidence < 1)).any():
+        doubted = (confidence > 0) & (confidence < 1)
+        if self._found is not None and doubted[_LIMBS].any():
             return self._found.lift(points, confidence, depths)
         seen = confidence > 0
         joints = np.zeros((1, LSP14.n_joints, self._output.n_columns), np.float32)

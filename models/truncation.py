@@ -15,7 +15,6 @@ last joint to be seen lies well within, a hip of somebody cut off at the thighs.
 GROWTHS = ((0.12, 2.2), (0.26, 1.8), (0.36, 1.4))
 """What the mean belief in all joints (``models.looks.belief``) lies under, and how much longer the
 whole person is: cut off at the waist, at the hips or thighs, at the knees (docs/experiments.md)."""
-
 PLAINLY = 1.2
 """How many times as much must be believed of the whole person: of who ends near the edge, but is
 not cut off, the larger view is believed in a little more now and then, and read worse."""

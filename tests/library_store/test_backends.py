@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from library_store.backends import GRAPH_UP_TO, Backend, IndexSettings, index_settings
+from library_store.backends import (
+    DESCRIPTORS_FILE,
+    GRAPH_UP_TO,
+    Backend,
+    IndexSettings,
+    index_settings,
+)
 from library_store.build import BuildSettings, build_library, verify_library
 from library_store.errors import LibraryError
 from library_store.hnsw import HNSW_FILE, HnswSettings
@@ -32,7 +38,8 @@ def test_a_library_built_with_a_graph_is_searched_with_it(graph_directory: Path)
     manifest = verify_library(graph_directory)
     assert manifest.index["backend"] == "hnsw"
     assert HNSW_FILE in manifest.index["files"]
-    queries = np.random.default_rng(1).normal(size=(20, 14, 2))
+    seen = np.load(graph_directory / DESCRIPTORS_FILE)[:20].reshape(20, 14, 2)
+    queries = seen + np.random.default_rng(1).normal(0.0, 0.05, seen.shape)
     weights = np.ones((20, 14))
     weights[::2, 4] = 0.0
     truth = load(graph_directory, backend="exact").match(queries, weights, 5)

@@ -116,7 +116,9 @@ def test_joints_that_are_not_all_sure_are_another_network_s(
     unsure = EVERYBODY.copy()
     unsure[L_WRIST] = 0.4
     points = image(seen)[0]
-    for confidence, network in ((EVERYBODY, stated), (unsure, found)):
+    guessed = EVERYBODY.copy()
+    guessed[[0, 1]] = 0.0, 0.5  # of another skeleton's sure joints
+    for confidence, network in ((EVERYBODY, stated), (unsure, found), (guessed, stated)):
         own = PoseLifter(network.card.name).lift(points, confidence)
         np.testing.assert_array_equal(lifter.lift(points, confidence).depths, own.depths)
     missing = EVERYBODY.copy()
