@@ -27,13 +27,14 @@ _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _PNG_NEEDED = frozenset({b"tRNS", b"acTL", b"fcTL", b"fdAT"})
 """Of the ancillary chunks: pixels do not depend on the others, of which libpng inflates each text,
 to 8 MB at most, and complains of each that it does not like."""
-_JPEG_NOT_FILL = re.compile(rb"[^\xff]")
-_JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+"""By colour type."""
 _PNG_UNCHECKED = 1_000_000
 """Compressed bytes of pixels that are not inflated to see how many they are: libpng would inflate
 whatever follows the last row too, a thousand bytes from each."""
 _PNG_PIECE = 1 << 20
+_JPEG_NOT_FILL = re.compile(rb"[^\xff]")
+_JPEG_MARKER = re.compile(rb"\xff[\x01-\xcf\xd8-\xfe]")
 _TEXT = re.compile(rb"[\t-\r\x1b -~]+")
 _ISO_BRANDS = {
     b"hevc": "a HEIF sequence",
@@ -234,12 +235,9 @@ def _read_png(data: bytes) -> ImageHeader:
         _corrupt(kind, "it holds no image")
     # Interlaced, an image has more rows, and bytes for their filters and ends.
     most = size[1] * (row_bits // 8 + 16) + _PNG_PIECE
-    deflated = Deflated(kind, tuple(pixels), most) if _is_much(pixels) else None
+    is_much = sum(end - start for start, end in pixels) > _PNG_UNCHECKED
+    deflated = Deflated(kind, tuple(pixels), most) if is_much else None
     return ImageHeader(kind, size[0], size[1], exif, has_alpha, tuple(needless), deflated)
-
-
-def _is_much(spans: list[tuple[int, int]]) -> bool:
-    return sum(end - start for start, end in spans) > _PNG_UNCHECKED
 
 
 def _read_webp(data: bytes) -> ImageHeader:

@@ -16,7 +16,7 @@ nothing of body size, which a photo does not show, and covers less of people of 
 given subject height, which scales the radius with the answer.
 
 b and c (``evaluation.photo_sigma``): 600 rendered people in poses of the same subjects, turned and
-tumbled, their joints found by the shipped CPM. On 590 others it covers 66%; 38% without b and c.
+tumbled, their joints found by the shipped CPM. On 590 others it covers 65%; 37% without b and c.
 """
 
 from __future__ import annotations

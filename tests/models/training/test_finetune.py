@@ -130,19 +130,19 @@ def test_a_run_goes_on_with_what_it_began_with_only(start: Path, tmp_path: Path)
         run(crops, 3)
 
 
+def on_from(weights: Path, start: str, out: Path) -> FinetuneResult:
+    """Without labels: what is wrong with the start is said before."""
+    settings = FinetuneSettings()
+    return finetune(
+        [], weights_dir=weights, start=start, out=out, name="ours", source="", settings=settings
+    )
+
+
 def test_a_network_of_another_architecture_is_refused(tmp_path: Path) -> None:
     weights = tmp_path / "weights"
     tiny_onnx.write(weights, "foreign", tiny_onnx.model(tiny_onnx.planes()))
     with pytest.raises(ModelError, match=r"foreign cannot be trained on: it has no .fine_score"):
-        finetune(
-            [],
-            weights_dir=weights,
-            start="foreign",
-            out=tmp_path / "out",
-            name="ours",
-            source="",
-            settings=FinetuneSettings(),
-        )
+        on_from(weights, "foreign", tmp_path / "out")
 
 
 @pytest.mark.parametrize(
@@ -156,15 +156,7 @@ def test_weights_that_are_not_their_cards_are_refused(
     if damage == "cut":
         (start / "start.onnx").write_bytes(data[: len(data) // 2])
     with pytest.raises(ModelError, match=rf"start\.onnx {said}"):
-        finetune(
-            [],
-            weights_dir=start,
-            start="start",
-            out=tmp_path / "out",
-            name="ours",
-            source="",
-            settings=FinetuneSettings(),
-        )
+        on_from(start, "start", tmp_path / "out")
 
 
 def test_what_cannot_be_trained_on_is_refused(tmp_path: Path) -> None:
