@@ -11,6 +11,8 @@ the rest of a body refused unread         read and dropped for ``patience_s``, t
 an answer that the client does not take   closed after ``patience_s``
 ========================================= ==================================================
 
+Requests that came whole before any of these have their answers first.
+
 Under overload nearly all requests are refused, and what a refusal costs is taken from the answers:
 those that can be given from the request's head alone (``app.api.shedding``) are written from here,
 without a task and a walk through the application. And no answer is sent with Python's lock held
@@ -68,6 +70,7 @@ class Connection(HttpToolsProtocol):
         self._head_bytes = 0
         self._dropped_bytes = 0
         self._in_body = False
+        self._last_word: tuple[int, str, str] | None = None
         self._expect("head", self.transport.close)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -79,6 +82,8 @@ class Connection(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Feed the parser; a head may be split over many pieces but not over too many bytes."""
+        if self._last_word is not None:
+            return  # nothing more is answered
         if self.transport.is_closing():  # for ours, the rest of an upload that is answered
             self._dropped_bytes += len(data)
             if self._dropped_bytes > MAX_DROPPED_BYTES:
@@ -130,6 +135,9 @@ class Connection(HttpToolsProtocol):
         super().on_response_complete()
         if answered is not None and answered.more_body and not self.transport.is_closing():
             self._expect("rest", self._give_up)
+        word, self._last_word = self._last_word, None
+        if word is not None:
+            self._end(*word)
 
     def shutdown(self) -> None:
         """The service ends, and waits for answers only."""
@@ -161,13 +169,18 @@ class Connection(HttpToolsProtocol):
             timer.cancel()
 
     def _end(self, status: int, slug: str, detail: str) -> None:
-        """Answer with a problem and close, unless another answer is due or has begun."""
+        """Answer with a problem and close, once the requests before are answered."""
         if self.transport.is_closing():
             self.transport.close()
             return
-        cycle = self.cycle
-        begun = cycle is not None and cycle.response_started and not cycle.response_complete
-        if not begun and not self.pipeline:
+        cycle, running = self.cycle, self._running
+        own = cycle if cycle is not None and cycle.more_body else None
+        if self.pipeline and self.pipeline[0][0] is own:
+            self.pipeline.popleft()  # this is its answer
+        if running is not None and running is not own and not running.response_complete:
+            self._last_word = status, slug, detail
+            return
+        if own is None or not own.response_started:
             request_id = new_request_id()
             client = self.client[0] if self.client else None
             logger.info(

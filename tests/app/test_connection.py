@@ -94,6 +94,39 @@ def test_what_is_no_http_gets_a_problem(server: Server, data: bytes) -> None:
         check_problem(connection, 400, "malformed-http")
 
 
+@pytest.mark.parametrize("before", [1, 3])
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"garbage\r\n\r\n",
+        b"POST /v1/lift HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\nnot-hex\r\n",
+    ],
+)
+def test_requests_before_what_is_no_http_are_answered(
+    server: Server, before: int, data: bytes
+) -> None:
+    lift = b"POST /v1/lift HTTP/1.1\r\nHost: x\r\nX-Request-ID: %d\r\nContent-Length: 2\r\n\r\n{}"
+    with server.connect() as connection, connection.makefile("rb") as stream:
+        connection.sendall(b"".join(lift % number for number in range(before)) + data)
+        for number in range(before):
+            status, headers, _ = read_whole(stream)
+            assert (status, headers["x-request-id"]) == (422, str(number))
+        status, headers, body = read_whole(stream)
+        assert (status, json.loads(body)["request_id"]) == (400, headers["x-request-id"])
+        assert stream.read() == b""
+
+
+def test_a_request_is_answered_once(server: Server) -> None:
+    """Here before its body, which then turns out to be none."""
+    with server.connect() as connection, connection.makefile("rb") as stream:
+        connection.sendall(
+            b"POST /nowhere HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n"
+        )
+        assert read_whole(stream)[0] == 404
+        connection.sendall(b"not-hex\r\n")
+        assert stream.read() == b""
+
+
 def test_the_connection_outlives_a_refusal(server: Server) -> None:
     """The body that was not wanted is dropped; what comes after it is the next request."""
     with server.connect() as connection:
