@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 
 
@@ -18,4 +19,6 @@ def main() -> None:
 
     if heard:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if os.getpid() == 1:  # in a container: the kernel drops the signals it does not handle
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     cli.main()

@@ -23,9 +23,12 @@ def print_json(text: str) -> None:
 
 @contextmanager
 def stage_progress() -> Iterator[Callable[[str, float], None]]:
-    """A bar per stage on stderr; yields the callback that stages report their fraction to."""
+    """A bar per stage on stderr; yields the callback that stages report their fraction to.
+
+    Where stderr is no terminal but a log, a line per stage as it begins.
+    """
     columns = (TextColumn("{task.description:>24}"), BarColumn(), TimeElapsedColumn())
-    bars = Progress(*columns, console=notices)
+    bars = Progress(*columns, console=notices, disable=not notices.is_terminal)
     tasks: dict[str, TaskID] = {}
 
     def report(stage: str, fraction: float) -> None:
@@ -33,6 +36,8 @@ def stage_progress() -> Iterator[Callable[[str, float], None]]:
             bars.start()  # not before there is something to say: stderr may be a full disk
         if stage not in tasks:
             tasks[stage] = bars.add_task(stage, total=1.0)
+            if bars.disable:
+                notices.print(f"{stage} ...", highlight=False, markup=False)
         bars.update(tasks[stage], completed=fraction)
 
     try:

@@ -270,6 +270,7 @@ def test_library_commands(library_dir: Path, tmp_path: Path) -> None:
     built = tmp_path / "tiny"
     done = run("library", "build", "--directory", built, "--size", 100)
     assert done.returncode == 0, done.stderr
+    assert "poses ...\n" in done.stderr, "no bars: this is no terminal"
     (built / "cameras.npy").write_bytes(b"oops")
     broken = run("library", "verify", built)
     assert broken.returncode == 1

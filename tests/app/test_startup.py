@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import shutil
 import signal
 import socket
@@ -77,6 +78,31 @@ def test_control_c_is_ignored_where_the_shell_says_so() -> None:
         assert process.stdout is not None
         assert process.stdout.read().strip() == VERSION
     assert process.returncode == 0
+
+
+@pytest.mark.parametrize("is_cached", [False, True])
+def test_a_container_is_stopped_at_any_time(
+    tmp_path: Path, library_dir: Path, is_cached: bool
+) -> None:
+    """There it is PID 1, which no signal ends by itself: while it builds its library, too."""
+    alone = ["unshare", "--pid", "--fork", "--kill-child"]
+    if subprocess.run([*alone, "true"], stderr=subprocess.DEVNULL, check=False).returncode:
+        pytest.skip("no PID namespace may be made here")
+    word, settings = (
+        ("ready", environment(library_dir=library_dir))
+        if is_cached
+        else ("poses ...", environment(cache_dir=tmp_path))
+    )
+    with subprocess.Popen(
+        [*alone, COMMAND, "serve", "--port", "0"], env=settings, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        assert any(word in line for line in process.stderr)
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text()
+        os.kill(int(children), signal.SIGTERM)
+        _, said = process.communicate(timeout=30)
+    assert "Traceback" not in said
+    assert process.returncode == (0 if is_cached else 128 + signal.SIGINT)
 
 
 def test_an_address_that_is_taken(tmp_path: Path, library_dir: Path) -> None:
