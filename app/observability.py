@@ -204,7 +204,7 @@ def request_id_of(scope: Scope) -> str:
     """The id that the client gave its request, or a new one."""
     for name, value in scope["headers"]:
         if name == b"x-request-id":
-            given = value.decode("latin-1")
+            given = value.decode("latin-1").strip()  # the parser leaves the blanks at its end
             return given if _REQUEST_ID.fullmatch(given) else new_request_id()
     return new_request_id()
 

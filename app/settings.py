@@ -221,10 +221,11 @@ class Settings(BaseSettings):
 
     @field_validator("cache_dir", "library_dir", "weights_dir", mode="before")
     @classmethod
-    def _is_not_empty(cls, directory: Any) -> Any:
+    def _is_a_directory(cls, directory: Any) -> Any:
         if directory == "":  # it would be the current directory
             raise ValueError("is empty; unset it for the default")
-        return directory
+        # What a shell does; files of variables, as containers and units have them, know no ~.
+        return os.path.expanduser(directory) if isinstance(directory, str) else directory
 
     @field_validator("milvus_uri")
     @classmethod

@@ -77,8 +77,8 @@ async def authorise(request: Request, service: ServiceDep) -> None:
     if not service.key_digests:
         return
     scheme, _, token = request.headers.get("authorization", "").partition(" ")
-    given = token.strip() if scheme.lower() == "bearer" else request.headers.get("x-api-key", "")
-    digest = _digest(given)
+    given = token if scheme.lower() == "bearer" else request.headers.get("x-api-key", "")
+    digest = _digest(given.strip())
     matches = [hmac.compare_digest(digest, key) for key in service.key_digests]
     if not any(matches):
         raise UnauthorizedError("give a key as 'Authorization: Bearer KEY' or 'X-API-Key: KEY'")

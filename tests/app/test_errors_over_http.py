@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from tests.app.conftest import API_KEY
-from tests.app.server import Server, read_response
+from tests.app.server import Server, read_response, read_whole
 
 
 def problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:
@@ -170,6 +170,16 @@ def test_quota_and_both_ways_to_give_a_key(keyed_server: Server) -> None:
     assert 1 <= int(response.headers["retry-after"]) <= 10
     other = {"X-API-Key": "another-key-with-enough-characters"}
     assert client.get("/v1/info", headers=other).status_code == 200, "quotas are per key"
+
+
+def test_blanks_at_the_end_of_a_header_are_not_its_value(keyed_server: Server) -> None:
+    with keyed_server.connect() as connection, connection.makefile("rb") as stream:
+        connection.sendall(
+            b"GET /v1/info HTTP/1.1\r\nHost: x\r\nX-Request-ID: mine \r\n"
+            b"X-API-Key: another-key-with-enough-characters \t\r\n\r\n"
+        )
+        status, headers, _ = read_whole(stream)
+    assert (status, headers["x-request-id"]) == (200, "mine")
 
 
 def test_cors_is_an_allow_list(keyed_server: Server, server: Server) -> None:

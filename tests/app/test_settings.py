@@ -24,11 +24,13 @@ def _no_settings(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_values_come_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("POSEMATCH_PORT", "9000")
     monkeypatch.setenv("POSEMATCH_LIBRARY_DIR", "/srv/library")
+    monkeypatch.setenv("POSEMATCH_CACHE_DIR", "~/poses")
     monkeypatch.setenv("POSEMATCH_API_KEYS", "first-key-long-enough, second-key-long-enough")
     monkeypatch.setenv("POSEMATCH_CORS_ORIGINS", "https://a.example,http://localhost:3000")
     settings = load_settings()
     assert settings.port == 9000
     assert settings.library_dir == Path("/srv/library")
+    assert settings.cache_dir == Path.home() / "poses", "no folder called ~"
     assert len(settings.api_keys) == 2
     assert settings.cors_origins == ("https://a.example", "http://localhost:3000")
     assert "first-key" not in repr(settings)
