@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import logging
 import random
@@ -17,7 +18,7 @@ from prometheus_client.process_collector import ProcessCollector
 from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.errors import PROBLEM_TYPE_PREFIX
+from app.errors import NotReadyError, RequestError
 
 logger = logging.getLogger("posematch")
 access_logger = logging.getLogger("posematch.access")
@@ -156,7 +157,8 @@ class RequestContextMiddleware:
     """Gives each request its id, and each response its headers, metrics and log line.
 
     The handlers leave stage timings in ``scope["state"]["timings_ms"]``. An exception nothing
-    else handled becomes a 500 that says nothing but the request id; the log has the rest.
+    else handled becomes a 500 that says nothing but the request id; the log has the rest. Whatever
+    the server cancels, as it does when it has waited long enough before it ends, is a 503.
     """
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
@@ -188,11 +190,17 @@ class RequestContextMiddleware:
         inner = {**scope, "method": "GET"} if scope["method"] == "HEAD" else scope
         try:
             await self._app(inner, receive, send_with_headers)
+        except asyncio.CancelledError:
+            if status:
+                raise
+            error = NotReadyError("the service is shutting down")
+            await _send_problem(error, request_id, send_with_headers)
         except Exception:
             logger.exception("unhandled error", extra={"request_id": request_id})
             if status:
                 raise  # the answer has begun; only closing the connection is left
-            await _send_internal_error(request_id, send_with_headers)
+            wrong = "something went wrong here; the request id identifies it in our log"
+            await _send_problem(RequestError(wrong), request_id, send_with_headers)
         finally:
             route = state.get("route") or getattr(inner.get("route"), "path", "unmatched")
             record_request(
@@ -248,21 +256,23 @@ def record_request(
 _METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 
 
-async def _send_internal_error(request_id: str, send: Send) -> None:
+async def _send_problem(error: RequestError, request_id: str, send: Send) -> None:
     body = json.dumps(
         {
-            "type": PROBLEM_TYPE_PREFIX + "internal-error",
-            "title": "Internal error",
-            "status": 500,
-            "detail": "something went wrong here; the request id identifies it in our log",
+            "type": error.type_uri,
+            "title": error.title,
+            "status": error.status,
+            "detail": error.detail,
             "request_id": request_id,
         }
     ).encode()
-    headers = [
-        (b"content-type", b"application/problem+json"),
-        (b"content-length", str(len(body)).encode()),
-    ]
-    await send({"type": "http.response.start", "status": 500, "headers": headers})
+    headers = {
+        "content-type": "application/problem+json",
+        "content-length": str(len(body)),
+        **error.headers,
+    }
+    raw = [(name.lower().encode(), value.encode()) for name, value in headers.items()]
+    await send({"type": "http.response.start", "status": error.status, "headers": raw})
     await send({"type": "http.response.body", "body": body})
 
 

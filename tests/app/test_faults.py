@@ -7,6 +7,7 @@ of its steps in ``tests/library_store``.
 from __future__ import annotations
 
 import http.client
+import json
 import resource
 import shutil
 import subprocess
@@ -26,6 +27,7 @@ from tests.app.server import (
     environment,
     free_port,
     read_response,
+    read_whole,
 )
 from tests.app.test_startup import refusal
 
@@ -167,6 +169,27 @@ def test_sigterm_under_load(tmp_path: Path, library_dir: Path, photo: bytes) -> 
     assert set(seen) <= {"200", "503", "refused", "closed before it was read"}
     assert seen["closed before it was read"] <= len(clients), "idle connections, closed as we sent"
     assert code in {0, -15}
+    assert "Traceback" not in server.log.read_text()
+
+
+@pytest.mark.parametrize("grace_s", [0, 1])
+def test_an_upload_that_outlasts_the_grace(
+    tmp_path: Path, library_dir: Path, photo: bytes, grace_s: int
+) -> None:
+    """It is told so, and the log has no error of it: somebody slow is nothing out of order."""
+    settings = {"library_dir": library_dir, "shutdown_grace_s": grace_s}
+    with Server(tmp_path / "log", **settings) as server, server.connect() as connection:
+        head = b"POST /v1/poses HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n" % len(photo)
+        connection.sendall(head + photo[:1000])
+        while server.metric("posematch_upload_bytes") < 1000:
+            time.sleep(0.01)
+        server.stop()
+        with connection.makefile("rb") as stream:
+            status, headers, body = read_whole(stream)
+    assert status == 503
+    assert headers["content-type"] == "application/problem+json"
+    assert headers["retry-after"] == "1"
+    assert json.loads(body)["type"] == "urn:posematch:problem:not-ready"
     assert "Traceback" not in server.log.read_text()
 
 

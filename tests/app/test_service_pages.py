@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 import time
 
+import httpx
+
+from app.observability import Metrics, RequestContextMiddleware
 from app.schemas import InfoAnswer
 from tests.app.server import Server
 
@@ -71,6 +75,24 @@ def test_log_lines_are_json_with_the_request_id(server: Server) -> None:
         time.sleep(0.01)
     (line,) = map(json.loads, found)
     assert (line["method"], line["path"], line["status"]) == ("GET", "/livez", 200)
+
+
+def test_an_error_of_ours_says_nothing_but_its_id() -> None:
+    async def broken(*_: object) -> None:
+        raise RuntimeError("/srv/secret")
+
+    async def ask() -> httpx.Response:
+        transport = httpx.ASGITransport(RequestContextMiddleware(broken, Metrics()))
+        async with httpx.AsyncClient(transport=transport, base_url="http://x") as client:
+            return await client.get("/livez", headers={"X-Request-ID": "mine"})
+
+    response = asyncio.run(ask())
+    assert response.status_code == 500
+    assert response.headers["content-type"] == "application/problem+json"
+    problem = response.json()
+    assert (problem["type"], problem["status"]) == ("urn:posematch:problem:internal-error", 500)
+    assert problem["request_id"] == response.headers["x-request-id"] == "mine"
+    assert "secret" not in response.text
 
 
 def test_the_page_asks_nobody_else(server: Server) -> None:
