@@ -3,8 +3,9 @@
 A joint's rotation is the product of its rotation channels in the order listed, relative to its
 parent, and turns the offsets of its children; position channels replace the joint's own offset,
 except where all they ever say is zero: programs that add them to the offset write that.
-Offsets have no stated unit. CMU's two conversions are known (``joint_tables``): their unit, the
-thorax and wrist bones they lost, and the T-pose that one of them puts before the first frame.
+Offsets have no stated unit. CMU's two conversions are known (``joint_tables``): their unit, where
+that makes a person, the thorax and wrist bones they lost, and the T-pose that one of them puts
+before the first frame.
 Root-centred joints then agree with ASF/AMC of the same clip within 7 mm (0.3 to 4 mm on the mean,
 eleven clips of four people): thoraxes are not quite as long as upper backs.
 """
@@ -20,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from library_store.importers.asf_amc import CMU_LICENCE, describe_cmu
-from library_store.importers.checks import checked
+from library_store.importers.checks import checked, unit_scale
 from library_store.importers.clip import Clip, Float, MocapError
 from library_store.importers.head import HEAD_PER_TRUNK, put_head_top
 from library_store.importers.joint_tables import (
@@ -78,6 +79,9 @@ def read(path: Path, *, mapping: Path | None = None) -> Clip:
     else:
         table = _table_for(path, bvh)
         positions, findings = _by_table(bvh, table)
+    mm_per_unit = table.mm_per_unit or 1.0
+    if unit_scale(positions * mm_per_unit)[0] != 1.0:
+        mm_per_unit = 1.0  # written anew in another unit, which the checks find
     frames = np.arange(len(positions), dtype=np.int64)
     rate = 1.0 / bvh.frame_time_s if bvh.frame_time_s else math.nan
     subject = action = ""
@@ -96,7 +100,7 @@ def read(path: Path, *, mapping: Path | None = None) -> Clip:
         subject=subject,
         action=action,
         frame_rate_hz=round(rate, 3),
-        positions_mm=(positions * (table.mm_per_unit or 1.0)).astype(np.float32),
+        positions_mm=(positions * mm_per_unit).astype(np.float32),
         frames=frames,
         findings=(f"joint names: {table.name}", *findings),
         licence=CMU_LICENCE if subject else "",
@@ -295,6 +299,5 @@ def restore_thorax(bvh: BvhFile, table: JointTable) -> tuple[BvhFile, list[str]]
         replace(joint, offset=offset) if joint.parent == back and _is_zero(joint) else joint
         for joint in bvh.joints
     )
-    length_mm = offset[1] * (table.mm_per_unit or 1.0)
-    finding = f"thorax of {length_mm:.0f} mm above {bvh.joints[back].name} put back"
+    finding = f"thorax above {bvh.joints[back].name}, as long as the upper back, put back"
     return replace(bvh, joints=joints), [finding]

@@ -28,7 +28,8 @@ from library_store.skeleton import LSP14
 class JointTable:
     """Targets in lsp14 order, and what is known about files that use these names.
 
-    mm_per_unit: None where files differ (the checks then find the unit by the person's size).
+    mm_per_unit: None where files differ (the checks then find the unit by the person's size, as
+        they do where this one makes nobody's).
     lost_thorax: the joint whose children were moved onto it when the thorax bone was made zero
         long: those with zero offset get the length of the joint's own, the upper back's.
     wrist_stretch: elbow to wrist over the elbow to the joint named as the wrist.
