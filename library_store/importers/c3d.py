@@ -2,8 +2,10 @@
 
 The marker sets of :mod:`library_store.importers.markers` are known; for others a mapping file says
 which marker, or the mean of which markers, each joint is. A file may hold several people, told
-apart by the prefix of their markers (``Ann:LFHD``): each becomes a clip. Gaps of up to a tenth of a
-second are filled along straight lines; frames with longer ones are dropped.
+apart by the prefix of their markers (``Ann:LFHD``): each becomes a clip. A mapping file may leave
+the prefix out, and is for everybody then. Gaps of up to a tenth of a second are filled along
+straight lines; frames with longer ones are dropped. Where the unit that a file states makes
+nobody's size, it is found by the markers' distances, before joints are put beside them.
 
 Reading needs ezc3d, of the extra ``mocap``. It crashes on some damaged files and therefore runs in
 a process of its own, ``c3d_child``.
@@ -26,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from library_store.importers.asf_amc import CMU_LICENCE, describe_cmu
-from library_store.importers.checks import checked_or_error
+from library_store.importers.checks import checked_or_error, unit_scale
 from library_store.importers.clip import Clip, Float, MocapError
 from library_store.importers.joint_tables import JointMapping, read_mapping
 from library_store.importers.markers import (
@@ -35,6 +37,7 @@ from library_store.importers.markers import (
     fill_gaps,
     find_marker_set,
     joint_centres,
+    markers_by_joint,
     sizes_from,
 )
 from library_store.importers.rotation import up_to_y
@@ -76,7 +79,7 @@ def read(path: Path, *, mapping: Path | None = None) -> list[Clip | MocapError]:
     clips: list[Clip | MocapError] = []
     left_out: list[str] = []
     for person, markers in file.people.items():
-        named = _joints_of(markers, table, sizes_from(file.stated), file.rate_hz)
+        named = _joints_of(person, markers, table, sizes_from(file.stated), file.rate_hz)
         if named is None:
             left_out += [person or "markers without a prefix"]
             continue
@@ -177,13 +180,19 @@ def _frame_range(path: Path, file: BinaryIO) -> tuple[int, int]:
 
 
 def _joints_of(
-    markers: Mapping[str, Float], table: JointMapping | None, sizes: Sizes, rate_hz: float
+    person: str,
+    markers: Mapping[str, Float],
+    table: JointMapping | None,
+    sizes: Sizes,
+    rate_hz: float,
 ) -> tuple[Float, str, list[str]] | None:
     """Joints (F, 14, 3), the name of the set, findings; None where the markers are not those."""
     marker_set = find_marker_set(frozenset(markers))
+    own: list[list[str]] = []
     if table is not None:
-        wanted = tuple(name.upper() for targets in table.targets for name in targets)
-        name = table.name
+        prefix = f"{person}:".upper() if person else ""
+        own = [[it.upper().removeprefix(prefix) for it in names] for names in table.targets]
+        wanted, name = tuple(it for names in own for it in names), table.name
     elif marker_set is not None:
         wanted, name = marker_set.markers, marker_set.name
     else:
@@ -198,7 +207,13 @@ def _joints_of(
     )
     findings = [f"{n_filled} marker positions in short gaps filled"] if n_filled else []
     if table is not None:
-        means = [np.mean([filled[m.upper()] for m in targets], axis=0) for targets in table.targets]
+        means = [np.mean([filled[it] for it in names], axis=0) for names in own]
         return np.stack(means, axis=1), name, findings
     assert marker_set is not None
+    beside = markers_by_joint(marker_set, filled)
+    seen = beside[np.isfinite(beside).all(axis=(1, 2))]
+    scale, finding = unit_scale(seen) if len(seen) else (None, "")
+    if scale is not None and finding:
+        findings.append(finding)
+        filled = {marker: scale * track for marker, track in filled.items()}
     return joint_centres(marker_set, filled, sizes), name, findings

@@ -109,6 +109,16 @@ def sizes_from(stated: Mapping[str, float]) -> Sizes:
     return Sizes(**given)
 
 
+def markers_by_joint(marker_set: MarkerSet, markers: Mapping[str, Float]) -> Float:
+    """For each joint the marker nearest to it, (F, 14, 3): enough to tell a person's size by."""
+    names = ["RFHD", "C7"]
+    for side in "RL":
+        names += [side + marker for marker in ("SHO", "ELB", "WRA")]
+    for side, waist in zip("RL", reversed(marker_set.front), strict=True):
+        names += [waist, f"{side}KNE", f"{side}ANK"]
+    return np.stack([markers[name] for name in names], axis=1)
+
+
 def joint_centres(marker_set: MarkerSet, markers: Mapping[str, Float], sizes: Sizes) -> Float:
     """Joints (F, 14, 3) from markers (F, 3), mm, in the markers' frame, whichever axis is up.
 

@@ -56,14 +56,18 @@ def write_c3d(
     *,
     rate_hz: float = 120.0,
     unit: str = "mm",
+    unit_mm: float | None = None,
     up: str = "+Z",
     stated: dict[str, float] | None = None,
 ) -> Path:
-    """A C3D file of markers (F, 3) in mm, Y up, which the file has in ``unit`` and with Z up."""
+    """A C3D file of markers (F, 3) in mm, Y up, which the file has in ``unit`` and with Z up.
+
+    ``unit_mm``: how long the unit really is, where that is not what its name says.
+    """
     file = c3d()
     names = list(tracks)
     points = np.stack([tracks[name] for name in names], axis=1)  # (F, N, 3)
-    scale = {"mm": 1.0, "m": 0.001}[unit]
+    scale = 1.0 / (unit_mm or {"mm": 1.0, "m": 1000.0}[unit])
     z_up = points[..., [0, 2, 1]] * (scale, -scale, scale)
     n_frames = len(z_up)
     data = np.ones((4, len(names), n_frames))

@@ -39,6 +39,24 @@ def test_plug_in_gait_in_metres_with_stated_sizes(tmp_path: Path) -> None:
     assert (clip.subject, clip.licence) == ("", "")
 
 
+@pytest.mark.parametrize(
+    ("unit", "unit_mm", "said"),
+    [
+        ("inches", 25.4, "inches: scaled by 25.4"),
+        ("Meters", 1000.0, "metres: scaled by 1000"),
+        ("", 10.0, "centimetres: scaled by 10"),
+        ("mm", 1000.0, "metres: scaled by 1000"),
+    ],
+)
+def test_a_unit_that_is_not_what_the_file_says(
+    tmp_path: Path, unit: str, unit_mm: float, said: str
+) -> None:
+    """Joints lie so many millimetres beside the markers: the unit must be known before."""
+    (clip,) = read(write_c3d(tmp_path / "a.c3d", TRACKS, unit=unit, unit_mm=unit_mm))
+    assert_allclose(clip.positions_mm, TRUTH, atol=0.05)
+    assert said in " ".join(clip.findings)
+
+
 def test_two_people_are_two_clips(tmp_path: Path) -> None:
     ann = {f"Ann:{name}": track for name, track in TRACKS.items()}
     beside = np.array([1000.0, 0.0, 0.0])
@@ -118,6 +136,20 @@ def test_a_mapping_file_from_joint_to_markers(tmp_path: Path) -> None:
     expected = TRUTH.copy()
     expected[:, wrist, 2] += 10.0
     assert_allclose(clip.positions_mm, expected, atol=0.02)
+
+
+def test_a_mapping_file_with_prefixes_is_for_who_has_them(tmp_path: Path) -> None:
+    tracks = {f"{who}:m{i}": TRUTH[:, i] for who in ("Ann", "Bob") for i in range(14)}
+    path = write_c3d(tmp_path / "pair.c3d", tracks)
+    mapping = tmp_path / "mapping.json"
+    for prefix, names in (("", ["pair_Ann", "pair_Bob"]), ("Ann:", ["pair_Ann"])):
+        table = {joint: f"{prefix}m{i}" for i, joint in enumerate(LSP14.joint_names)}
+        mapping.write_text(json.dumps(table))
+        clips = read(path, mapping=mapping)
+        assert [clip.name for clip in clips] == names
+        for clip in clips:
+            assert_allclose(clip.positions_mm, TRUTH, atol=0.02)
+    assert "left out, not the markers of a person: Bob" in clips[0].findings
 
 
 @pytest.mark.parametrize("size", [0, 100, 700, 5_000])
