@@ -79,7 +79,7 @@ class NpzFile:
         values = self[name] if name in self.names else np.array([])
         if values.ndim != 1:
             raise MocapError(self._path, f"array {name!r} must have one dimension")
-        return [str(value) for value in values]
+        return [_string(value) for value in values]
 
     def number(self, name: str) -> float:
         """The number stored under ``name``; NaN where there is none."""
@@ -93,7 +93,12 @@ class NpzFile:
         if name not in self.names:
             return ""
         value = self[name]
-        return str(value.reshape(-1)[0]) if value.size == 1 else ""
+        return _string(value.reshape(-1)[0]) if value.size == 1 else ""
+
+
+def _string(value: object) -> str:
+    # Arrays of bytes are what strings become on their way through HDF5, MATLAB or Python 2.
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
 def _read_array(data: bytes) -> np.ndarray[Any, Any]:

@@ -151,6 +151,22 @@ def test_recordings_strung_together_are_not_taken_for_one(tmp_path: Path, poses:
     assert len(read(path)[0]) == 40, "the same poses twice are no doubt which is which"
 
 
+def test_strings_that_became_bytes_are_strings(tmp_path: Path, poses: Float) -> None:
+    """On their way through HDF5, MATLAB or Python 2."""
+    np.savez(
+        tmp_path / "a.npz",
+        positions=poses,
+        joint_names=np.array(LSP14.joint_names, dtype=bytes),
+        clip_name=np.array(["Läufer".encode()]),
+        clip_fps=np.array([b"50"]),
+        up_axis=np.array(b"Y"),
+        license=np.array(b"CC0"),
+    )
+    (clip,) = read(tmp_path / "a.npz")
+    assert_allclose(clip.positions_mm, poses, atol=0.01)
+    assert (clip.name, clip.frame_rate_hz, clip.licence) == ("Läufer", 50.0, "CC0")
+
+
 def test_a_clip_without_a_licence_does_not_get_that_of_another(
     tmp_path: Path, poses: Float
 ) -> None:
