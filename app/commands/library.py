@@ -126,6 +126,12 @@ def build(
         directory = build_if_missing(settings)
         output.print(str(directory), highlight=False, soft_wrap=True)
         return
+    for file in files or ():
+        if file.suffix.lower() != ".npz":
+            raise typer.BadParameter(
+                f"{file} is no npz file of clips: `posematch library import` makes one of it",
+                param_hint="--from",
+            )
     try:
         wanted = BuildSettings(
             name=name or directory.absolute().name,

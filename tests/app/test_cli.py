@@ -302,6 +302,10 @@ def test_a_library_of_ones_own(tmp_path: Path) -> None:
     refused = run(*build, "--size", 500)
     assert refused.returncode == 1
     assert "a.npz: does not say under which licence clip 'dance'" in refused.stderr
+    (tmp_path / "walk.bvh").write_text("HIERARCHY")
+    unread = invoke(*build, "--from", tmp_path / "walk.bvh", "--licence", "ours")
+    assert unread.exit_code == 2
+    assert "`posematch library import`" in unread.stderr
     done = invoke(*build, "--size", 500, "--licence", "ours", "--radius-mm", 5)
     assert done.exit_code == 0, done.stderr
     assert "licence of a.npz: ours\nlicence of b.npz: CC BY 4.0" in done.stdout
