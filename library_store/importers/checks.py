@@ -235,15 +235,16 @@ def up_rotation(positions_mm: Float, *, up_is_known: bool) -> tuple[Float, str]:
 
 
 def sides_are_swapped(positions_mm: Float) -> bool:
-    """Whether nearly all clearly bent knees of poses (F, 14, 3) bend backwards."""
-    left = positions_mm[:, L_HIP] - positions_mm[:, R_HIP]
-    ahead = unit(np.cross(left, positions_mm[:, NECK] - root_of(positions_mm)))
+    """Whether nearly all clearly bent knees of poses (F, 14, 3) bend backwards.
+
+    Thigh cross shank, the knee's hinge, then points to the right: whichever way the trunk leans.
+    """
+    left = unit(positions_mm[:, L_HIP] - positions_mm[:, R_HIP])
     bends = []
     for hip, knee, ankle in ((R_HIP, R_KNEE, R_ANKLE), (L_HIP, L_KNEE, L_ANKLE)):
         leg = unit(positions_mm[:, ankle] - positions_mm[:, hip])
         thigh = positions_mm[:, knee] - positions_mm[:, hip]
-        out = thigh - (thigh * leg).sum(-1, keepdims=True) * leg
-        bends.append((out * ahead).sum(-1))
+        bends.append((np.cross(thigh, leg) * left).sum(-1))  # mm: how far the knee is off the leg
     bend = np.concatenate(bends)
     clear = bend[np.abs(bend) > _BENT_MM]
     return len(clear) >= _MIN_BENT and float((clear < 0.0).mean()) > _MOST

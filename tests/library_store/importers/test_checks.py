@@ -104,6 +104,27 @@ def test_swapped_sides_are_exchanged(standing: Float) -> None:
     assert_allclose(clip.positions_mm, standing, atol=0.1)
 
 
+def test_somebody_who_sits_and_bends_down_to_the_feet_keeps_their_sides() -> None:
+    """Knees stick out upwards then, and away from the chest."""
+    left = {
+        "shoulder": (180, 700, 430),
+        "elbow": (200, 430, 480),
+        "wrist": (160, 200, 520),
+        "hip": (90, 480, 0),
+        "knee": (130, 500, 420),
+        "ankle": (130, 80, 400),
+    }
+    places = {f"l_{name}": place for name, place in left.items()}
+    places |= {f"r_{name}": (-x, y, z) for name, (x, y, z) in left.items()}
+    places |= {"neck": (0, 720, 460), "head_top": (0, 780, 720)}
+    pose = np.array([places[name] for name in LSP14.joint_names], dtype=float)
+    seated = pose + np.linspace(0.0, 100.0, 40)[:, None, None]
+    clip = checked(FILE, clip_of(seated), up_is_known=True)
+    assert_allclose(clip.positions_mm, seated, atol=0.1)
+    swapped = checked(FILE, clip_of(seated[:, LSP14.mirror]), up_is_known=True)
+    assert_allclose(swapped.positions_mm, seated, atol=0.1)
+
+
 @pytest.mark.parametrize("rate_hz", [0.0, -30.0, np.inf])
 def test_a_frame_rate_that_is_none_is_not_known(standing: Float, rate_hz: float) -> None:
     clip = checked(FILE, clip_of(standing, rate_hz))
