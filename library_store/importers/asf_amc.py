@@ -5,10 +5,11 @@ frame C in which the AMC's angles are given. With M the product of a bone's moti
 rotation in the world is W_child = W_parent C M C⁻¹, and its end is the parent's end plus
 W direction · length. ``axis a b c XYZ`` is C = Rz(c) Ry(b) Rx(a), and so is M for ``dof rx ry rz``.
 
-Lengths are in inches divided by the file's ``length`` unit, so 25.4 / 0.45 mm each for CMU. Joints
-are ends of bones: the neck is the end of ``lowerneck``, the wrist that of ``lwrist`` (``lradius``
-ends in the forearm, two thirds of the way from elbow to wrist). The bone ``head`` ends inside the
-skull: the head top is 1.6 of its length from its start, as in the prior's data. Y is up.
+Lengths are in inches divided by the file's ``length`` unit, so 25.4 / 0.45 mm each for CMU, unless
+that makes nobody's size. Joints are ends of bones: the neck is the end of ``lowerneck``, the wrist
+that of ``lwrist`` (``lradius`` ends in the forearm, two thirds of the way from elbow to wrist). The
+bone ``head`` ends inside the skull: the head top is 1.6 of its length from its start, as in the
+prior's data. Y is up.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from library_store.importers.checks import checked
+from library_store.importers.checks import checked, unit_that_fits
 from library_store.importers.clip import Clip, Float, Frames, MocapError
 from library_store.importers.rotation import euler
 from library_store.skeleton import HEAD_TOP
@@ -110,7 +111,7 @@ def read(path: Path, *, skeleton: Path | None = None) -> Clip:
         subject=subject,
         action=action,
         frame_rate_hz=rate,
-        positions_mm=(joints * asf.mm_per_unit).astype(np.float32),
+        positions_mm=(joints * unit_that_fits(joints, asf.mm_per_unit)).astype(np.float32),
         frames=frames,
         findings=findings,
         licence=CMU_LICENCE if subject else "",

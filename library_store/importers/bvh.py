@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from library_store.importers.asf_amc import CMU_LICENCE, describe_cmu
-from library_store.importers.checks import checked, unit_scale
+from library_store.importers.checks import checked, unit_that_fits
 from library_store.importers.clip import Clip, Float, MocapError
 from library_store.importers.head import HEAD_PER_TRUNK, put_head_top
 from library_store.importers.joint_tables import (
@@ -79,9 +79,7 @@ def read(path: Path, *, mapping: Path | None = None) -> Clip:
     else:
         table = _table_for(path, bvh)
         positions, findings = _by_table(bvh, table)
-    mm_per_unit = table.mm_per_unit or 1.0
-    if unit_scale(positions * mm_per_unit)[0] != 1.0:
-        mm_per_unit = 1.0  # written anew in another unit, which the checks find
+    mm_per_unit = unit_that_fits(positions, table.mm_per_unit or 1.0)
     frames = np.arange(len(positions), dtype=np.int64)
     rate = 1.0 / bvh.frame_time_s if bvh.frame_time_s else math.nan
     subject = action = ""

@@ -199,6 +199,16 @@ def unit_scale(positions: Float) -> tuple[float | None, str]:
     )
 
 
+def unit_that_fits(positions: Float, stated: float) -> float:
+    """The length of a unit of poses (F, 14, 3) in mm: as stated, or 1 where that makes nobody.
+
+    ``checked`` then finds the unit by the person's size.
+    """
+    whole = positions[np.isfinite(positions).all(axis=(1, 2))]
+    fits = not len(whole) or unit_scale(whole * stated)[0] == 1.0
+    return stated if fits else 1.0
+
+
 def find_glitches(positions_mm: Float, frames: Frames, frame_rate_hz: float) -> NDArray[np.bool_]:
     """Whether each frame (F,) has a bone of another length or a joint that jumps out and back."""
     starts, ends = np.array(_RIGID).T

@@ -144,6 +144,26 @@ def test_byte_order_marks_and_comments(clip_file: Path) -> None:
     assert_allclose(clip.positions_mm, truth.positions_mm)
 
 
+@pytest.mark.parametrize(
+    ("mm_per_unit", "said"), [(MM, "CMU's units"), (10.0, "centimetres"), (1000.0, "metres")]
+)
+def test_a_length_that_is_not_the_files_unit(
+    clip_file: Path, mm_per_unit: float, said: str
+) -> None:
+    (truth,) = read(clip_file)
+    factor = MM / mm_per_unit
+    asf = re.sub(
+        r"(?<=     length )\S+", lambda found: f"{float(found[0]) * factor:.9f}", ASF
+    ).replace("length 0.45", "length 1.0")
+    clip_file.with_name("02.asf").write_text(asf)
+    motion = walk()
+    motion["root"][:, :3] *= factor
+    clip_file.write_text(amc(motion))
+    (clip,) = read(clip_file)
+    assert_allclose(clip.positions_mm, truth.positions_mm, atol=0.05)
+    assert any(said in finding for finding in clip.findings)
+
+
 @pytest.mark.parametrize("length", ["0", "-0.45", "nan", "inf", "long"])
 def test_a_skeleton_without_a_length_is_refused(clip_file: Path, length: str) -> None:
     asf = clip_file.with_name("02.asf")
