@@ -48,7 +48,7 @@ TIMEOUT_S = 300.0
 _MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4}
 _CMU = MARKER_SETS[0].name
 _MIPS = bytes([86])
-"""The processor type whose numbers have their high byte first."""
+"""The processor type of SGI's machines, whose numbers have their high byte first."""
 _MANY = 65_535
 """The header cannot count further; longer files are not held against it. No rate is so high."""
 
@@ -175,7 +175,11 @@ def _frame_range(path: Path, file: BinaryIO) -> tuple[int, int]:
     if len(header) < 512 or not header[0]:
         raise MocapError(path, "not a whole C3D file: it has no header")
     file.seek(512 * (header[0] - 1) + 3)
-    first, last = struct.unpack_from(">HH" if file.read(1) == _MIPS else "<HH", header, 6)
+    if file.read(1) == _MIPS:
+        raise MocapError(
+            path, "has numbers as MIPS processors write them, which ezc3d does not read: convert it"
+        )
+    first, last = struct.unpack_from("<HH", header, 6)
     return first, last
 
 

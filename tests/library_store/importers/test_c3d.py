@@ -160,6 +160,16 @@ def test_a_cut_file_is_refused(tmp_path: Path, size: int) -> None:
         read(path)
 
 
+def test_numbers_of_mips_processors_are_named(tmp_path: Path) -> None:
+    """Whole files, of SGI's machines, but none that ezc3d reads."""
+    path = write_c3d(tmp_path / "sgi.c3d", TRACKS)
+    content = bytearray(path.read_bytes())
+    content[512 * (content[0] - 1) + 3] = 86
+    path.write_bytes(content)
+    with pytest.raises(MocapError, match=r"sgi\.c3d: has numbers as MIPS processors"):
+        read(path)
+
+
 def test_noise_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "noise.c3d"
     path.write_bytes(np.random.default_rng(0).bytes(5_000))
