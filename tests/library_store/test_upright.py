@@ -3,8 +3,19 @@ import pytest
 from numpy.typing import NDArray
 
 from library_store.cameras import project, rolled_upright, rotations, sample_cameras
-from library_store.skeleton import HEAD_TOP, L_HIP, L_SHOULDER, NECK, R_HIP, R_SHOULDER
-from library_store.upright import MOST_LEAN, lean_rad, turn_rad
+from library_store.skeleton import (
+    HEAD_TOP,
+    L_ANKLE,
+    L_HIP,
+    L_KNEE,
+    L_SHOULDER,
+    NECK,
+    R_ANKLE,
+    R_HIP,
+    R_KNEE,
+    R_SHOULDER,
+)
+from library_store.upright import MOST_LEAN, MOST_LEAN_OF_HALF, lean_rad, turn_rad
 
 RNG = np.random.default_rng(0)
 
@@ -34,10 +45,23 @@ def test_how_much_somebody_leans() -> None:
         present = np.ones(14, bool)
         present[missing] = False
         assert lean_rad(leaning(person, 1.0), present) == pytest.approx(1.0, abs=0.3), missing
-    for missing in ([R_HIP, L_HIP], [R_HIP, L_SHOULDER, NECK, HEAD_TOP]):
+    for missing in ([R_HIP, L_HIP, HEAD_TOP], [R_HIP, L_SHOULDER, NECK, HEAD_TOP]):
         present = np.ones(14, bool)
         present[missing] = False
         assert lean_rad(leaning(person, 1.0), present) == 0.0, missing
+
+
+def test_people_cut_off_at_the_waist_lean_too() -> None:
+    person = standing()
+    person[[R_KNEE, L_KNEE, R_ANKLE, L_ANKLE]] = [[-25, 90], [25, 92], [-25, 180], [25, 180]]
+    for seen in ([R_SHOULDER, L_SHOULDER, NECK, HEAD_TOP], [R_HIP, L_HIP, R_KNEE, L_KNEE]):
+        present = np.zeros(14, bool)
+        present[seen] = True
+        for angle in (1.0, -2.0, 3.0):
+            turned = leaning(person, angle)
+            assert lean_rad(turned, present) == pytest.approx(angle, abs=0.1), seen
+            assert turn_rad(turned, present) == lean_rad(turned, present)
+        assert turn_rad(leaning(person, 0.9 * MOST_LEAN_OF_HALF), present) == 0.0
 
 
 def test_who_leans_a_little_is_left_so() -> None:
