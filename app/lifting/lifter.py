@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -27,7 +27,6 @@ from app.lifting.types import (
     Method,
     NotLiftable,
     Observation,
-    ScaleSource,
 )
 from app.lifting.warp import warp_perspective, warp_weak_perspective
 from library_store.library import Library
@@ -95,6 +94,17 @@ class LiftingSettings:
 
 
 @dataclass(frozen=True)
+class _Wanted:
+    """What a call asks for everybody; see :meth:`Lifter.lift`."""
+
+    intrinsics: Intrinsics
+    method: Method
+    subject_height_mm: float | None
+    n_candidates: int
+    lap: Callable[[str], None]
+
+
+@dataclass(frozen=True)
 class _Neighbours:
     """What eq. 4 finds for one person, nearest first: (K,), (K,), (K, 14, 3), (K, 3, 3)."""
 
@@ -102,6 +112,21 @@ class _Neighbours:
     distances: Floats
     poses_mm: Floats
     rotations: Floats
+
+
+@dataclass(frozen=True)
+class _Matched:
+    """One person in the centred view, and what was found for the joints that are relied on.
+
+    ``confidence`` (14,), 0 for joints that are missing or among the ``n_outliers`` set aside;
+    ``fused`` is None with the paper's method.
+    """
+
+    view: CentredView
+    confidence: Floats
+    neighbours: _Neighbours
+    fused: FusedPose | None
+    n_outliers: int
 
 
 @dataclass(frozen=True)
@@ -113,6 +138,27 @@ class _Shortlist:
     cameras: Cameras
     probabilities: Floats
     rms_px: float
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """The method's answer and the warped exemplar, (14, 3) each; ``sigma_mm`` (14,) of the former.
+
+    In the photo's camera frame.
+    """
+
+    joints_mm: Floats
+    warped_mm: Floats
+    sigma_mm: Floats | None
+
+    def at_height(self, height_mm: float) -> _Answer:
+        """Both poses so tall; lengths scaled about the camera centre, so that no image changes."""
+        scale = height_mm / float(stature_mm(self.joints_mm))
+        return _Answer(
+            joints_mm=self.joints_mm * scale,
+            warped_mm=self.warped_mm * (height_mm / float(stature_mm(self.warped_mm))),
+            sigma_mm=None if self.sigma_mm is None else self.sigma_mm * scale,
+        )
 
 
 class Lifter:
@@ -157,109 +203,95 @@ class Lifter:
             One result per observation, in order.
 
         """
-        return [
-            self._lift_person(
-                person, intrinsics, method, subject_height_mm, n_candidates, lap or _no_lap
-            )
-            for person in observations
-        ]
+        wanted = _Wanted(intrinsics, method, subject_height_mm, n_candidates, lap or _no_lap)
+        return [self._lift_person(person, wanted) for person in observations]
 
-    def _lift_person(
-        self,
-        person: Observation,
-        intrinsics: Intrinsics,
-        method: Method,
-        subject_height_mm: float | None,
-        n_candidates: int,
-        lap: Callable[[str], None],
-    ) -> LiftedPerson | NotLiftable:
-        settings = self._settings
+    def _lift_person(self, person: Observation, wanted: _Wanted) -> LiftedPerson | NotLiftable:
         confidence = np.where(
-            person.confidence >= settings.least_confidence, person.confidence, 0.0
+            person.confidence >= self._settings.least_confidence, person.confidence, 0.0
         )
         truncated = ("truncated",) if (confidence == 0).any() else ()
         refusal = _why_not_liftable(person.joints_px, confidence)
         if refusal is not None:
             return NotLiftable(refusal, truncated)
-        warnings = ["assumed_focal"] if intrinsics.source == "assumed" else []
-        warnings.extend(truncated)
+        assumed = ("assumed_focal",) if wanted.intrinsics.source == "assumed" else ()
+        matched = self._match(person, confidence, wanted)
+        if isinstance(matched, NotLiftable):
+            return replace(matched, warnings=(*assumed, *truncated))
+        shortlist = self._shortlist(matched)
+        wanted.lap("camera")
+        warnings = (*assumed, *truncated, *self._doubts(matched, shortlist))
+        answer = self._answer(matched, shortlist)
+        if not (answer.joints_mm[:, 2] > 0).all():
+            return NotLiftable("no pose in front of the camera explains the joints", warnings)
+        if wanted.subject_height_mm is not None:
+            answer = answer.at_height(wanted.subject_height_mm)
+        candidates = self._hypotheses(shortlist, matched, person, wanted)
+        wanted.lap("warp")
+        return LiftedPerson(
+            exemplar=candidates[0],
+            warped_mm=answer.warped_mm,
+            candidates=candidates[: wanted.n_candidates],
+            joints_3d_mm=answer.joints_mm,
+            sigma_mm=answer.sigma_mm,
+            noise_px=None if matched.fused is None else matched.fused.noise_px,
+            root_mm=0.5 * (answer.joints_mm[R_HIP] + answer.joints_mm[L_HIP]),
+            scale_source="library" if wanted.subject_height_mm is None else "request",
+            warnings=warnings,
+        )
 
-        depths = None
-        if person.depths_px is not None:
-            depths = person.depths_px / intrinsics.focal_length_px
-        outliers = 0
+    def _match(
+        self, person: Observation, confidence: Floats, wanted: _Wanted
+    ) -> _Matched | NotLiftable:
+        """The person's neighbours and their posterior, without joints that contradict the rest."""
+        focal_px = wanted.intrinsics.focal_length_px
+        centre_px = np.array(wanted.intrinsics.principal_point_px)
+        depths = None if person.depths_px is None else person.depths_px / focal_px
+        n_outliers = 0
         while True:
             view = centre_view(
-                person.joints_px,
-                confidence,
-                person.covariance_px2,
-                intrinsics.focal_length_px,
-                np.array(intrinsics.principal_point_px),
+                person.joints_px, confidence, person.covariance_px2, focal_px, centre_px
             )
             refusal = _why_not_seen(view)
             if refusal is not None:
-                return NotLiftable(refusal, tuple(warnings))
-            neighbours = self._neighbours(view, confidence > 0, method)
-            lap("match")
-            if method == "paper":
-                break
+                return NotLiftable(refusal)
+            neighbours = self._neighbours(view, confidence > 0, wanted.method)
+            wanted.lap("match")
+            if wanted.method == "paper":
+                return _Matched(view, confidence, neighbours, None, n_outliers)
             fused = self._fuse(view, confidence, depths, neighbours)
-            lap("warp")
-            if fused.outlier is None or outliers == settings.max_outliers:
-                break
+            wanted.lap("warp")
+            matched = _Matched(view, confidence, neighbours, fused, n_outliers)
+            if fused.outlier is None or n_outliers == self._settings.max_outliers:
+                return matched
             without = confidence.copy()
             without[fused.outlier] = 0.0
             if _why_not_liftable(person.joints_px, without) is not None:
-                break
+                return matched
             # Its neighbours were found with the contradicting joint: match again without it.
-            confidence, outliers = without, outliers + 1
-        if outliers:
-            warnings.append("inconsistent_joints")
-        if method == "fusion" and fused.ambiguous:
-            warnings.append("ambiguous_depth")
+            confidence, n_outliers = without, n_outliers + 1
 
-        shortlist = self._shortlist(view, confidence, neighbours)
-        lap("camera")
-        if shortlist.rms_px > settings.far_px:
-            warnings.append("far_from_library")
-        best = shortlist.cameras.points_mm[0]
-        present = confidence > 0
-        if method == "paper":
-            warped = answer = warp_weak_perspective(best, view.points, present)
-            sigma = noise_px = None
-        else:
-            warped, answer = warp_perspective(best, view.points, present), fused.joints_mm
-            noise_px = fused.noise_px
-            sigma = None
-            if settings.sigma:
-                sigma = settings.sigma(fused.spread_mm, noise_px, confidence)
-        answer, warped = view.to_photo(answer), view.to_photo(warped)
-        if not (answer[:, 2] > 0).all():
-            return NotLiftable(
-                "no pose in front of the camera explains the joints", tuple(warnings)
-            )
-        scale_source: ScaleSource = "library"
-        if subject_height_mm is not None:
-            scale_source = "request"
-            scale = subject_height_mm / float(stature_mm(answer))
-            answer = answer * scale
-            sigma = None if sigma is None else sigma * scale
-            warped = warped * (subject_height_mm / float(stature_mm(warped)))
-        candidates = self._hypotheses(
-            shortlist, view, person, confidence, intrinsics, subject_height_mm, max(n_candidates, 1)
-        )
-        lap("warp")
-        return LiftedPerson(
-            exemplar=candidates[0],
-            warped_mm=warped,
-            candidates=candidates[:n_candidates],
-            joints_3d_mm=answer,
-            sigma_mm=sigma,
-            noise_px=noise_px,
-            root_mm=0.5 * (answer[R_HIP] + answer[L_HIP]),
-            scale_source=scale_source,
-            warnings=tuple(warnings),
-        )
+    def _doubts(self, matched: _Matched, shortlist: _Shortlist) -> tuple[str, ...]:
+        """Warnings about the answer itself."""
+        doubts = {
+            "inconsistent_joints": matched.n_outliers > 0,
+            "ambiguous_depth": matched.fused is not None and matched.fused.ambiguous,
+            "far_from_library": shortlist.rms_px > self._settings.far_px,
+        }
+        return tuple(warning for warning, holds in doubts.items() if holds)
+
+    def _answer(self, matched: _Matched, shortlist: _Shortlist) -> _Answer:
+        """Eq. 6, or the fusion and the warped exemplar beside it."""
+        view, confidence, fused = matched.view, matched.confidence, matched.fused
+        best, present = shortlist.cameras.points_mm[0], confidence > 0
+        if fused is None:
+            warped = view.to_photo(warp_weak_perspective(best, view.points, present))
+            return _Answer(warped, warped, None)
+        warped = view.to_photo(warp_perspective(best, view.points, present))
+        sigma_mm = None
+        if self._settings.sigma is not None:
+            sigma_mm = self._settings.sigma(fused.spread_mm, fused.noise_px, confidence)
+        return _Answer(view.to_photo(fused.joints_mm), warped, sigma_mm)
 
     def _neighbours(self, view: CentredView, present: Mask, method: Method) -> _Neighbours:
         """Eq. 4's nearest exemplars, of the joints that are present."""
@@ -300,10 +332,9 @@ class Lifter:
             learned = self._network.lift(view.points, confidence, depths)
         return fuse(ensemble, view.points, confidence, covariance, self._settings.fusion, learned)
 
-    def _shortlist(
-        self, view: CentredView, confidence: Floats, neighbours: _Neighbours
-    ) -> _Shortlist:
+    def _shortlist(self, matched: _Matched) -> _Shortlist:
         """Eq. 5 for the k nearest, sorted by eq. 4 with M*."""
+        view, confidence, neighbours = matched.view, matched.confidence, matched.neighbours
         settings = self._settings
         k = settings.shortlist
         cameras = resect(
@@ -342,16 +373,14 @@ class Lifter:
     def _hypotheses(
         self,
         shortlist: _Shortlist,
-        view: CentredView,
+        matched: _Matched,
         person: Observation,
-        confidence: Floats,
-        intrinsics: Intrinsics,
-        subject_height_mm: float | None,
-        n: int,
+        wanted: _Wanted,
     ) -> tuple[Hypothesis, ...]:
-        """The n most probable candidates in the photo's camera frame."""
-        present = confidence > 0
-        cameras = shortlist.cameras
+        """The most probable candidates in the photo's camera frame, at least one."""
+        view, cameras, intrinsics = matched.view, shortlist.cameras, wanted.intrinsics
+        present = matched.confidence > 0
+        n = max(wanted.n_candidates, 1)
         joints = view.to_photo(cameras.points_mm[:n])
         # One product a candidate, so that the bytes do not depend on how many there are.
         translations = view.to_photo(cameras.translation_mm[:n, None])[:, 0]
@@ -361,8 +390,8 @@ class Lifter:
         )
         errors = np.sqrt(((pixels - person.joints_px[present]) ** 2).sum(-1).mean(-1))
         scale = np.ones(len(joints))
-        if subject_height_mm is not None:
-            scale = subject_height_mm / stature_mm(joints)
+        if wanted.subject_height_mm is not None:
+            scale = wanted.subject_height_mm / stature_mm(joints)
             joints, translations = scale[:, None, None] * joints, scale[:, None] * translations
         return tuple(
             Hypothesis(
