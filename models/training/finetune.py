@@ -27,7 +27,7 @@ from models.training import loop
 from models.training.augment import canonical, random_view
 from models.training.dataset import LabelledCrop
 from models.training.export import config_of, pose_card, publish, read_weights
-from models.training.network import ConvolutionalPoseMachine
+from models.training.network import ConvolutionalPoseMachine, CpmConfig
 from models.training.objective import total_loss
 from models.training.onnx_graph import pose_model
 from models.training.precision import mixed_precision
@@ -116,16 +116,49 @@ def finetune(
     ``out/run`` and is resumed from there. Raises ``ModelError``, also where ``out/run`` is of other
     labels or settings: who was held out then may have been trained on there.
     """
-    before_card = read_card(weights_dir / f"{start}.json")
-    output = before_card.output
-    if not isinstance(output, PoseOutput) or before_card.precision != "fp32":
+    begin = _read_start(weights_dir, start, out / f"{name}.onnx")
+    train, held = split(crops, settings.hold_out, settings.seed)
+    _keep_to(out / "run", _inputs(crops, begin.card, settings))
+    before = pck(weights_dir, start, held)
+    network, n_steps = _train(begin, train, held, out / "run", settings)
+    card = _publish(network, begin, name, source, out)
+    after = pck(out, name, held)
+    measured: dict[str, float | str] = {
+        "training_steps": float(n_steps),
+        "held_out_people": float(len(held)),
+        "pck_0.2/held_out/before": round(before, 4),
+        "pck_0.2/held_out/after": round(after, 4),
+    }
+    card = card.model_copy(update={"measured": measured})
+    write_card(out / f"{name}.json", card)
+    return FinetuneResult(card, len(train), len(held), before, after)
+
+
+@dataclass(frozen=True)
+class _Start:
+    """The network that is gone on from: its card and weights file, what it puts out, its shape."""
+
+    card: ModelCard
+    path: Path
+    output: PoseOutput
+    config: CpmConfig
+
+
+def _read_start(weights_dir: Path, start: str, result: Path) -> _Start:
+    """The network of card ``start``; ``ModelError`` if it is none to go on from.
+
+    Nor may it lie where the ``result`` shall be.
+    """
+    card = read_card(weights_dir / f"{start}.json")
+    if not isinstance(card.output, PoseOutput) or card.precision != "fp32":
         raise ModelError(f"model {start} cannot be trained on: name an fp32 pose network's card")
-    path = weights_dir / before_card.file
-    if path.resolve() == (out / f"{name}.onnx").resolve():
+    path = weights_dir / card.file
+    if path.resolve() == result.resolve():
         raise ModelError(
-            f"{out} is where {start} lies, which would be overwritten: give another --name or --out"
+            f"{result.parent} is where {start} lies, which would be overwritten: give another "
+            "--name or --out"
         )
-    read_file(path, before_card)  # it is there, whole and the card's
+    read_file(path, card)  # it is there, whole and the card's
     try:
         config = config_of(read_weights(path))
     except KeyError as error:
@@ -133,14 +166,21 @@ def finetune(
             f"model {start} cannot be trained on: it has no {error} as networks of this "
             "architecture do; name another in --start"
         ) from error
-    train, held = split(crops, settings.hold_out, settings.seed)
-    _keep_to(out / "run", _inputs(crops, before_card, settings))
-    before = pck(weights_dir, start, held)
-    size = output.input_px
+    return _Start(card, path, card.output, config)
+
+
+def _train(
+    begin: _Start,
+    train: list[LabelledCrop],
+    held: list[LabelledCrop],
+    run: Path,
+    settings: FinetuneSettings,
+) -> tuple[ConvolutionalPoseMachine, int]:
+    """The network after training, its weights averaged over the last steps; how many there were."""
     device = "cuda" if torch.cuda.is_available() else "cpu"
     args = argparse.Namespace(
-        out=out / "run",
-        init=path,
+        out=run,
+        init=begin.path,
         steps=settings.steps,
         minutes=settings.minutes,
         batch=min(BATCH_MOST, len(train)),
@@ -164,43 +204,35 @@ def finetune(
         return total_loss(stages, joints, weight, presence, x.shape[-1])
 
     loop.fit(
-        ConvolutionalPoseMachine(config),
+        ConvolutionalPoseMachine(begin.config),
         args,
-        sizes=[(1.0, size)],
+        sizes=[(1.0, begin.output.input_px)],
         make_batch=make_batch,
         loss_of=loss_of,
         evaluate=lambda model, px: {"pck_0.2/held_out": measure(model, held, px, device)},
-        config=config.as_dict(),
+        config=begin.config.as_dict(),
     )
-    state = loop.read_checkpoint(args.out / "last.pt")
-    network = ConvolutionalPoseMachine(config)
+    state = loop.read_checkpoint(run / "last.pt")
+    network = ConvolutionalPoseMachine(begin.config)
     network.load_state_dict(state["ema"])
-    network.eval()
-    fresh = pose_card(network, name, f"{before_card.version}+{name}", size)
-    card = publish(
-        pose_model(network, size),
-        fresh.model_copy(
-            update={
-                "output": _calibration_inherited(output, start),
-                "training_data": [*before_card.training_data, source],
-                "limits": before_card.limits,
-                "licence": f"{before_card.licence}; and whatever {source} demands",
-                "cost_ms": before_card.cost_ms,
-                "cost_cpu": before_card.cost_cpu,
-            }
-        ),
-        out,
-    )
-    after = pck(out, name, held)
-    measured: dict[str, float | str] = {
-        "training_steps": float(state["step"]),
-        "held_out_people": float(len(held)),
-        "pck_0.2/held_out/before": round(before, 4),
-        "pck_0.2/held_out/after": round(after, 4),
+    return network.eval(), state["step"]
+
+
+def _publish(
+    network: ConvolutionalPoseMachine, begin: _Start, name: str, source: str, out: Path
+) -> ModelCard:
+    """Write the network and its card, which says what it has from the one it began as."""
+    old, size = begin.card, begin.output.input_px
+    fresh = pose_card(network, name, f"{old.version}+{name}", size)
+    inherited = {
+        "output": _calibration_inherited(begin.output, old.name),
+        "training_data": [*old.training_data, source],
+        "limits": old.limits,
+        "licence": f"{old.licence}; and whatever {source} demands",
+        "cost_ms": old.cost_ms,
+        "cost_cpu": old.cost_cpu,
     }
-    card = card.model_copy(update={"measured": measured})
-    write_card(out / f"{name}.json", card)
-    return FinetuneResult(card, len(train), len(held), before, after)
+    return publish(pose_model(network, size), fresh.model_copy(update=inherited), out)
 
 
 def _inputs(crops: list[LabelledCrop], start: ModelCard, settings: FinetuneSettings) -> str:
