@@ -26,6 +26,12 @@ def test_a_doubtful_joint_widens_its_own_radius_most_and_everybody_s_a_little() 
     assert radius[4] == pytest.approx(np.sqrt(50.0**2 + (300.0 * 0.7 / 14) ** 2 + 280.0**2))
 
 
+def test_the_noise_found_widens_all_radii() -> None:
+    noisy = SigmaCalibration((1.0, *(2.0,) * 13), 4.0)
+    radius = noisy(SPREAD_MM, 9.0, SURE)
+    np.testing.assert_allclose(radius, np.hypot(50.0, 36.0) * np.array([1.0, *(2.0,) * 13]))
+
+
 def test_missing_joints_are_no_doubtful_ones() -> None:
     """What is not seen contradicts nobody: the posterior's spread knows of it."""
     confidence = SURE.copy()

@@ -78,6 +78,11 @@ def test_what_it_disagrees_by_is_counted_in_mm_about_the_root() -> None:
 
     np.testing.assert_allclose(apart(points, depths), 0.0, atol=1e-9)
     np.testing.assert_allclose(apart(points, depths + 0.1), 0.0, atol=1e-9)
+    # The root is between the hips: one of them moved moves it by half, all others away from it.
+    hip = depths.copy()
+    hip[8] += 0.02
+    wanted = np.full(14, 40.0)
+    np.testing.assert_allclose(apart(points, hip), wanted, atol=1e-9)
     moved, nearer = points.copy(), depths.copy()
     moved[4] += [3.0 / PX_PER_UNIT, 4.0 / PX_PER_UNIT]
     nearer[7] -= 0.01
@@ -177,6 +182,8 @@ def test_the_noisier_the_joints_the_more_is_left_to_the_network() -> None:
     assert doubts == sorted(doubts, reverse=True)
     assert doubts[0] == pytest.approx(settings.doubt_of_noisy + settings.doubt_of_exact)
     assert doubts[1] == pytest.approx(settings.doubt_of_noisy + 0.5 * settings.doubt_of_exact)
+    # By the fourth power of the noise: little is left of it at twice as much.
+    assert doubts[2] == pytest.approx(settings.doubt_of_noisy + settings.doubt_of_exact / 17)
 
 
 def test_suspected_joints_are_more_readily_set_aside() -> None:

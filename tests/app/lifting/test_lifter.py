@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from app.lifting.geometry import project, rotation_onto_axis
-from app.lifting.lifter import Lifter
+from app.lifting.lifter import Lifter, LiftingSettings
+from app.lifting.posterior import STANDARD_PX_PER_MM
 from app.lifting.stature import stature_mm
 from app.lifting.types import Intrinsics, LiftedPerson, Method, NotLiftable, Observation
 from app.lifting.warp import warp_weak_perspective
@@ -123,7 +124,11 @@ def test_subject_height_is_met_exactly_and_changes_no_image(
     )
     ratio = scaled.joints_3d_mm / plain.joints_3d_mm
     np.testing.assert_allclose(ratio, ratio[0, 2])
-    np.testing.assert_allclose(scaled.root_mm, ratio[0, 2] * plain.root_mm)
+    for person in (plain, scaled):
+        np.testing.assert_allclose(person.root_mm, person.joints_3d_mm[[R_HIP, L_HIP]].mean(0))
+    assert (plain.sigma_mm is None) == (scaled.sigma_mm is None) == (method == "paper")
+    if plain.sigma_mm is not None and scaled.sigma_mm is not None:
+        np.testing.assert_allclose(scaled.sigma_mm, ratio[0, 2] * plain.sigma_mm)
 
 
 def test_camera_places_the_exemplar_at_a_given_height(
@@ -308,6 +313,56 @@ def test_a_joint_far_off_is_set_aside(library: Library, people: People) -> None:
     assert "inconsistent_joints" not in lift_one(lifter, people.observation(1)).warnings
 
 
+def test_as_many_joints_are_set_aside_as_the_settings_allow(
+    library: Library, people: People
+) -> None:
+    network = PoseLifter()
+    errors = []
+    for most in (0, 1, 2):
+        lifter = Lifter(library, LiftingSettings(max_outliers=most), network)
+        error = []
+        for index in range(8):
+            pixels = people.joints_px[index].copy()
+            pixels[[3, 12]] += [[500.0, 500.0], [-700.0, -500.0]]
+            person = lift_one(lifter, observe(pixels))
+            assert ("inconsistent_joints" in person.warnings) == (most > 0)
+            error.append(rigid_error_mm(person.joints_3d_mm, people.joints_mm[index]).mean())
+        errors.append(np.median(error))
+    assert errors[2] < 0.5 * errors[1] < 0.5 * errors[0]
+    assert LiftingSettings().max_outliers == 2
+
+
+def test_nobody_is_left_with_fewer_joints_than_a_pose_needs(
+    library: Library, people: People
+) -> None:
+    """Of six joints each is needed, also one that contradicts the others."""
+    lifter = Lifter(library, network=PoseLifter())
+    kept = (2, 3, 8, 9, 11, 12)
+    set_aside = []
+    for missing in (set(range(14)) - set(kept), set(range(14)) - {*kept, 7}):
+        pixels = people.joints_px[1].copy()
+        pixels[9] += [700.0, -700.0]
+        person = lift_one(lifter, observe(pixels, tuple(missing)))
+        set_aside.append("inconsistent_joints" in person.warnings)
+    assert set_aside == [False, True]
+
+
+def test_who_is_far_from_the_library_is_said_by_standard_pixels(
+    library: Library, people: People
+) -> None:
+    """The RMS residual of the best exemplar, as if its person were shown at a fixed size."""
+    for index in range(4):
+        seen = people.observation(index)
+        best = lift_one(Lifter(library), seen, n_candidates=1).exemplar
+        depth_mm = best.joints_mm[[R_HIP, L_HIP], 2].mean()
+        px = best.reprojection_error_px
+        rms_px = px / INTRINSICS.focal_length_px * STANDARD_PX_PER_MM * depth_mm
+        for share in (0.8, 1.2):
+            settings = LiftingSettings(far_px=share * rms_px)
+            warnings = lift_one(Lifter(library, settings), seen).warnings
+            assert ("far_from_library" in warnings) == (share < 1)
+
+
 def test_a_limb_that_may_point_either_way_is_said(lifter: Lifter, people: People) -> None:
     errors: dict[bool, list[float]] = {False: [], True: []}
     for observation, truth in zip(
@@ -336,6 +391,60 @@ def test_stated_covariance_is_used(lifter: Lifter, people: People) -> None:
     truth = project_px(people.joints_mm[4])[4]
     moved = [np.linalg.norm(project_px(p.joints_3d_mm)[4] - truth) for p in (sure, unsure)]
     assert moved[1] < moved[0]
+
+
+def test_noise_that_is_stated_is_not_found_again(lifter: Lifter, people: People) -> None:
+    rng = np.random.default_rng(0)
+    noise_px = 12.0
+    found: dict[bool, list[float]] = {False: [], True: []}
+    for index in range(20):
+        pixels = people.joints_px[index] + rng.normal(0, noise_px, (14, 2))
+        stated = np.tile(noise_px**2 * np.eye(2), (14, 1, 1))
+        for is_stated, covariance in ((False, None), (True, stated)):
+            person = lift_one(lifter, Observation(pixels, np.ones(14), covariance))
+            assert person.noise_px is not None
+            found[is_stated].append(person.noise_px)
+    assert np.mean(found[True]) < 0.6 * np.mean(found[False])
+
+
+def test_candidates_of_noisy_joints_are_told_apart_as_poorly_as_stated(
+    library: Library, people: People
+) -> None:
+    """A covariance in the photo's pixels counts as one in standard pixels at the person's depth."""
+    noise_px = 60.0
+    by_default = LiftingSettings(sigma_2d_px=noise_px)
+    for index in range(4):
+        pixels = people.joints_px[index]
+        wanted = lift_one(Lifter(library, by_default), observe(pixels), n_candidates=50)
+        depths_mm = [one.joints_mm[[R_HIP, L_HIP], 2].mean() for one in wanted.candidates]
+        to_photo = INTRINSICS.focal_length_px / (STANDARD_PX_PER_MM * np.median(depths_mm))
+        stated = np.tile((to_photo * noise_px) ** 2 * np.eye(2), (14, 1, 1))
+        told = Observation(pixels, np.ones(14), stated)
+        person = lift_one(Lifter(library), told, n_candidates=50)
+        probable = {one.entry: one.probability for one in wanted.candidates}
+        assert {one.entry: one.probability for one in person.candidates} == pytest.approx(
+            probable, rel=0.02
+        )
+
+
+def test_the_camera_follows_unsure_joints_less(lifter: Lifter, people: People) -> None:
+    """Eq. 5 weighs joints by confidence."""
+    wrist = 4
+    pixels = people.joints_px[4].copy()
+    pixels[wrist] += [60.0, 0.0]
+    off_px = []
+    for confidence in (1.0, 0.25):
+        sure = np.ones(14)
+        sure[wrist] = confidence
+        person = lift_one(lifter, Observation(pixels, sure), method="paper", n_candidates=10)
+        by_entry = {
+            one.entry: np.linalg.norm(project_px(one.joints_mm)[wrist] - pixels[wrist])
+            for one in person.candidates
+        }
+        off_px.append(by_entry)
+    assert off_px[0].keys() == off_px[1].keys()
+    further = [off_px[1][entry] > off_px[0][entry] for entry in off_px[0]]
+    assert np.mean(further) > 0.8
 
 
 @pytest.fixture

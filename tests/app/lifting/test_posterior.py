@@ -48,3 +48,15 @@ def test_missing_joints_and_anisotropic_noise() -> None:
     weights[7] = 0.0
     probabilities = shortlist_probabilities(residuals, weights, covariance, 1.0)
     assert probabilities[2] > probabilities[0] > probabilities[1]
+
+
+def test_noise_in_any_direction_is_measured_by_its_inverse() -> None:
+    """Joints whose errors run along a slanting line, each along another."""
+    factors = RNG.normal(size=(14, 2, 2))
+    covariance = factors @ np.swapaxes(factors, 1, 2)
+    residuals, weights = RNG.normal(size=(5, 14, 2)), RNG.uniform(size=14)
+    inverse = np.linalg.inv(covariance + 0.5**2 * np.eye(2))
+    squared = np.einsum("j,kja,jab,kjb->k", weights, residuals, inverse, residuals)
+    expected = np.exp(-0.5 * squared)
+    probabilities = shortlist_probabilities(residuals, weights, covariance, 0.5)
+    np.testing.assert_allclose(probabilities, expected / expected.sum())

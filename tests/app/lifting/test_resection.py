@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from app.lifting.geometry import Floats, normalised_projection
-from app.lifting.resection import resect
+from app.lifting.resection import LEAST_EXTENT_MM, NEAREST_TO_EXTENT, resect
 from library_store.library import Library
 from tests.rotations import rotation_exponential
 
@@ -149,10 +149,17 @@ def test_what_does_not_belong_together_is_refused(poses: Floats) -> None:
         resect(poses[:3], np.stack([np.eye(3)] * 3), np.zeros((13, 2)), np.ones(13))
 
 
-def test_stays_in_front_of_the_camera_when_the_joints_are_nonsense(poses: Floats) -> None:
+@pytest.mark.parametrize("size", [0.2, 5.0])
+def test_stays_in_front_of_the_camera_when_the_joints_are_nonsense(
+    poses: Floats, size: float
+) -> None:
+    """Also where somebody so large could only be explained by a camera among the joints."""
     rotations, _ = random_cameras(len(poses))
-    targets = RNG.normal(size=(len(poses), 14, 2)) * 0.2
+    targets = RNG.normal(size=(len(poses), 14, 2)) * size
     found = resect(poses, rotations, targets, np.ones(14))
+    depth_mm = found.translation_mm[:, 2]
+    forward_mm = -(found.points_mm[..., 2] - depth_mm[:, None]).min(1)
+    assert (depth_mm > (NEAREST_TO_EXTENT - 1e-9) * np.maximum(forward_mm, LEAST_EXTENT_MM)).all()
     assert (found.points_mm[..., 2] > 0).all()
     assert np.isfinite(found.residuals).all()
 

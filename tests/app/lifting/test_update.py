@@ -102,6 +102,15 @@ def test_sides_observed_as_equally_long(pose: LocalPrior) -> None:
     assert np.abs(asymmetry(joints_of(found.mean))).sum() < np.abs(ratio).sum()
 
 
+def test_a_segment_without_length_says_nothing_of_the_other_side(pose: LocalPrior) -> None:
+    """A wrist at its elbow has no direction in which it could be longer."""
+    mean = pose.mean.copy()
+    mean[[8, 9, 28 + 4]] = mean[[6, 7, 28 + 3]]
+    found = made_symmetric(LocalPrior(mean, pose.covariance, ROOT_MM), PX, 0.15)
+    assert np.isfinite(found.mean).all()
+    assert np.isfinite(found.covariance).all()
+
+
 def test_the_answer_is_as_tall_and_as_unsure_as_it_should_be(pose: LocalPrior) -> None:
     still = LocalPrior(pose.mean, 1e-12 * np.eye(42), ROOT_MM)
     plain = answer_of(still, PX, 1500.0)
