@@ -79,6 +79,19 @@ def test_a_hill_is_believed_before_a_sharper_peak_of_less_belief() -> None:
     maps = np.stack([hill + peak, np.zeros_like(hill)])[None].astype(np.float32)
     read = read_maps(maps, 1, "beliefs", target_sigma_cells=1.0)
     np.testing.assert_allclose(read.at[0, 0], (10, 20), atol=0.1)
+    assert read.peak[0, 0] == pytest.approx(maps[0, 0, 20, 10]), "of that place, not of the sharper"
+
+
+def test_what_is_lost_to_others_counts_against_the_joint_not_for_its_place() -> None:
+    maps = gaussian(17.3, 22.6, 2.0, 2.0)[None, None].repeat(2, axis=1).astype(np.float32)
+    alone = read_maps(maps, 1, "logits", target_sigma_cells=1.0)
+    halved = read_maps(maps, 1, "logits", 1.0, own=lambda p, _: np.full_like(p, 0.5))
+    np.testing.assert_allclose(halved.at, alone.at, atol=1e-6)
+    np.testing.assert_allclose(halved.covariance, alone.covariance, rtol=1e-5)
+    near_peak = 2
+    np.testing.assert_allclose(
+        halved.features[..., near_peak], 0.5 * alone.features[..., near_peak], rtol=1e-6
+    )
 
 
 def test_beliefs_and_logits_give_the_same_place() -> None:

@@ -89,6 +89,18 @@ def test_boxes_are_in_the_pixels_of_the_photo_given() -> None:
     np.testing.assert_allclose([other.width_px, other.height_px], 2 * size, rtol=1e-5)
 
 
+def test_boxes_end_with_the_photo() -> None:
+    photo = cv2.imread(str(PHOTO))
+    assert photo is not None
+    height, width = photo.shape[0] // 2, photo.shape[1]
+    cut = np.ascontiguousarray(photo[:height], np.uint8)
+    boxes = PersonDetector(provider="cpu").detect(cut, 100, threshold=0.01)
+    low, high = np.split(corners(boxes), 2, axis=1)
+    assert low.min() >= 0
+    assert (high <= np.array([width, height]) - 1 + 1e-9).all()
+    assert (low == 0).any() or (high == np.array([width, height]) - 1).any()
+
+
 @pytest.mark.parametrize("side", [24, 47, 64, 65, 131, 200, 255])
 def test_a_shrunk_photo_keeps_its_pixels_in_place(side: int) -> None:
     """In a ramp each pixel says where it was, to a pixel of the canvas, halved exactly or not."""

@@ -74,6 +74,40 @@ def test_people_are_told_apart(estimator: PoseEstimator) -> None:
             np.testing.assert_allclose(person.depths_px, alone.depths_px, rtol=1e-6)
 
 
+@pytest.mark.parametrize(("level", "taken"), [(83, False), (120, True)])
+def test_a_cut_off_person_s_larger_view_counts_where_it_is_plainly_believed_in_more(
+    tmp_path: Path, level: int, taken: bool
+) -> None:
+    """Joints, spread and depths are then those of that view."""
+    # Belief and depths grow with the brightest spot of the crop: 80 is believed in by 0.18.
+    data = tiny_onnx.model(
+        planes(
+            tiny_onnx.constant("middle", np.array([128.0], np.float32)),
+            tiny_onnx.constant("unit", np.array([32.0], np.float32)),
+            node("Sub", ["planes", "middle"], "lighter"),
+            node("Div", ["lighter", "unit"], "logits"),
+            node("ReduceMax", ["planes"], "bright", axes=[2, 3], keepdims=0),
+            node("ReduceMax", ["bright"], "most", axes=[1]),
+            node("Concat", ["bright"] * 4 + ["most"] * 2, "depths", axis=1),
+            node("Concat", ["logits"] * 5, "all", axis=1),
+            last="all",
+        ),
+        also="depths",
+    )
+    output: Any = tiny_onnx.card("tiny", data)["output"]
+    output |= {"joint_names": LSP14.joint_names, "depths": True}
+    tiny_onnx.write(tmp_path, "tiny", data, output=output)
+    estimator = PoseEstimator("tiny", weights_dir=tmp_path)
+    image = np.zeros((400, 400, 3), np.uint8)
+    image[330:370, 180:220] = 80
+    image[330:370, 94:134] = level  # beside the crop, but not beside that of the whole person
+    (found,) = estimator.estimate(image, [PersonBox(150.0, 300.0, 100.0, 95.0, 1.0)])
+    assert found.depths_px is not None
+    at, side_px, seen = (114, 1.25 * 1.8 * 95, level) if taken else (200, 1.25 * 100, 80)
+    np.testing.assert_allclose(found.positions_px, np.tile([at, 350.0], (14, 1)), atol=8)
+    np.testing.assert_allclose(found.depths_px, seen * side_px, rtol=0.02)
+
+
 @pytest.mark.parametrize("name", ["cpm", "cpm-int8"])
 def test_the_shipped_networks_see_which_limb_is_nearer(name: str) -> None:
     """Of people with exact truth, and as well of their mirror images."""

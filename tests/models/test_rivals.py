@@ -82,6 +82,23 @@ def test_somebody_who_is_not_there_takes_nothing() -> None:
     assert np.abs(after[0, R_WRIST] - THEIRS).max() < 1
 
 
+def test_who_has_lost_a_place_no_longer_claims_it() -> None:
+    """Of claims of 3 to 1 a quarter is left to the other at first, and then a tenth."""
+    p = np.stack([seen(1.0, ORIGIN[0], [(R_WRIST, MINE, 0.9)])] * 2)
+    belief = np.array([[0.9] * N, [0.3] * N])
+    own = shares(p, belief, np.ones(2), np.array([ORIGIN[0]] * 2), STRIDE)
+    np.testing.assert_allclose(own[0, R_WRIST], 0.9, rtol=1e-5)
+    np.testing.assert_allclose(own[1, R_WRIST], 0.1, rtol=1e-5)
+
+
+def test_a_place_is_the_same_in_crops_of_any_size() -> None:
+    """Two views of one wrist: their claims meet where it is, not half a cell beside."""
+    scale, origin = [1.0, 2.6], [ORIGIN[0], (-60.0, -70.0)]
+    p = np.stack([seen(*view, [(R_WRIST, MINE, 0.9)]) for view in zip(scale, origin, strict=True)])
+    before, after = places(p, scale, origin), settled(p, scale, origin)
+    np.testing.assert_allclose(after[:, R_WRIST], before[:, R_WRIST], atol=0.1)
+
+
 def test_a_person_found_twice_keeps_both_answers() -> None:
     peaks: list[Peak] = [(R_WRIST, THEIRS, 0.6), (R_WRIST, MINE, 0.35), (R_ANKLE, MINE, 0.8)]
     p = np.stack([seen(SCALE[0], ORIGIN[0], peaks)] * 2)
