@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +23,7 @@ from library_store.sources import Source
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
+Answer = TypeVar("Answer", schemas.PosesAnswer, schemas.LiftAnswer)
 
 LENGTH_DIGITS = 3
 """Decimals of pixels and millimetres."""
@@ -121,7 +124,7 @@ def poses_answer(
     request_id: str,
     skeleton: schemas.AnswerSkeleton = "lsp14",
 ) -> schemas.PosesAnswer:
-    """The answer to POST /v1/poses, without the total time."""
+    """The answer to POST /v1/poses, without ``wait`` and ``total`` (:func:`timed` adds them)."""
     wording = wording_in(skeleton)
     return schemas.PosesAnswer(
         request_id=request_id,
@@ -135,7 +138,7 @@ def poses_answer(
         ),
         skeleton=wording.skeleton,
         people=tuple(_person(person, result.intrinsics, wording) for person in result.people),
-        timings_ms=rounded_timings(result.timings_ms),
+        timings_ms=_rounded(result.timings_ms),
     )
 
 
@@ -146,7 +149,7 @@ def lift_answer(
     request_id: str,
     skeleton: schemas.AnswerSkeleton = "lsp14",
 ) -> schemas.LiftAnswer:
-    """The answer to POST /v1/lift, without the total time."""
+    """The answer to POST /v1/lift, without ``wait`` and ``total`` (:func:`timed` adds them)."""
     wording = wording_in(skeleton)
     return schemas.LiftAnswer(
         request_id=request_id,
@@ -154,7 +157,7 @@ def lift_answer(
         library=library_of(engine.library),
         skeleton=wording.skeleton,
         people=tuple(_person(person, result.intrinsics, wording) for person in result.people),
-        timings_ms=rounded_timings(result.timings_ms),
+        timings_ms=_rounded(result.timings_ms),
     )
 
 
@@ -180,7 +183,20 @@ def exemplar_answer(library: Library, exemplar_id: str) -> schemas.ExemplarAnswe
     )
 
 
-def rounded_timings(timings_ms: Mapping[str, float]) -> dict[str, float]:
+def timed(compute: Callable[[], Answer], since_s: float) -> tuple[Answer, bytes]:
+    """What ``compute`` answers, with ``wait`` and ``total`` among its timings; and as JSON.
+
+    Both count from ``since_s`` (``time.monotonic`` seconds); the wait ends where this is called.
+    """
+    wait_ms = 1e3 * (time.monotonic() - since_s)
+    answer = compute()
+    total_ms = 1e3 * (time.monotonic() - since_s)
+    timings_ms = {"wait": wait_ms} | answer.timings_ms | {"total": total_ms}
+    answer = answer.model_copy(update={"timings_ms": _rounded(timings_ms)})
+    return answer, answer.model_dump_json().encode()
+
+
+def _rounded(timings_ms: Mapping[str, float]) -> dict[str, float]:
     """Milliseconds to the microsecond."""
     return {stage: round(spent, TIMING_DIGITS) for stage, spent in timings_ms.items()}
 

@@ -216,16 +216,7 @@ class Pipeline:
             exif_focal_length_px=photo.exif_focal_length_px,
         )
         clock.lap("decode")
-        boxes = self._boxes(seen, query)
-        clock.lap("detect")
-        boxes, joints = self._people(seen, boxes, query)
-        clock.lap("pose")
-        if not boxes:
-            boxes = self._detector.detect_close(seen.pixels_bgr, 2 * query.max_people)
-            clock.lap("detect")
-            boxes, joints = self._people(seen, boxes, query)
-        joints = [_to_image(found, seen) for found in joints]
-        clock.lap("pose")
+        boxes, joints = self._find(seen, query, clock)
         observations = [
             Observation(
                 joints_px=found.positions_px,
@@ -309,6 +300,25 @@ class Pipeline:
             )
         except IndexUnavailableError as error:
             raise LibraryUnavailableError(error.retry_after_s) from error
+
+    def _find(
+        self, seen: Photo, query: PhotoQuery, clock: StageClock
+    ) -> tuple[list[PersonBox], list[Joints2D]]:
+        """Whom to answer, in the decoded photo's pixels, and their joints in full-size pixels.
+
+        Where there is nobody, who fills the photo is looked for.
+        """
+        boxes = self._boxes(seen, query)
+        clock.lap("detect")
+        boxes, joints = self._people(seen, boxes, query)
+        clock.lap("pose")
+        if not boxes:
+            boxes = self._detector.detect_close(seen.pixels_bgr, 2 * query.max_people)
+            clock.lap("detect")
+            boxes, joints = self._people(seen, boxes, query)
+        joints = [_to_image(found, seen) for found in joints]
+        clock.lap("pose")
+        return boxes, joints
 
     def _boxes(self, seen: Photo, query: PhotoQuery) -> list[PersonBox]:
         """The people to look at, in the decoded photo's own pixels."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections import Counter
 
 import numpy as np
@@ -11,7 +10,7 @@ from fastapi import APIRouter, Depends, Request, Response
 from pydantic import ValidationError
 
 from app import schemas
-from app.answers import lift_answer, rounded_timings
+from app.answers import lift_answer, timed
 from app.api.bodies import WatchedArrival, read_body
 from app.api.deps import EngineDep, ServiceDep, authorise, no_query
 from app.api.problems import describe, describe_ok, invalid_input
@@ -53,19 +52,16 @@ async def lift_people(request: Request, service: ServiceDep, engine: EngineDep) 
         )
         with WatchedArrival(request.receive) as arrival:
 
-            def work() -> tuple[schemas.LiftAnswer, bytes]:
-                wait_ms = 1e3 * (time.monotonic() - arrival.at_s)
+            def lift() -> schemas.LiftAnswer:
                 wanted = parse_lift_request(body)
                 result = engine.pipeline.lift(query_of(wanted))
-                answer = lift_answer(
+                return lift_answer(
                     engine, result, wanted.method, request_id, wanted.answer_skeleton
                 )
-                total_ms = 1e3 * (time.monotonic() - arrival.at_s)
-                timings_ms = {"wait": wait_ms} | answer.timings_ms | {"total": total_ms}
-                answer = answer.model_copy(update={"timings_ms": rounded_timings(timings_ms)})
-                return answer, answer.model_dump_json().encode()
 
-            answer, encoded = await service.admission.run("lift", work, arrival)
+            answer, encoded = await service.admission.run(
+                "lift", lambda: timed(lift, arrival.at_s), arrival
+            )
     request.state.timings_ms.update(answer.timings_ms)
     warnings = (person.warnings for person in answer.people)
     service.metrics.count_answer("joints", answer.timings_ms, warnings)

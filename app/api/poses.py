@@ -12,7 +12,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from app import schemas
 from app.admission import Arrival, ClientGoneError
-from app.answers import poses_answer, rounded_timings
+from app.answers import poses_answer, timed
 from app.api.bodies import (
     Part,
     WatchedArrival,
@@ -187,16 +187,11 @@ def _work(
     """The computation of one photo up to its JSON, to be run on a worker thread."""
     query = parameters.query()
 
-    def work() -> tuple[schemas.PosesAnswer, bytes]:
-        wait_ms = 1e3 * (time.monotonic() - arrival.at_s)
+    def estimate() -> schemas.PosesAnswer:
         result = engine.pipeline.estimate(photo(), query)
-        answer = poses_answer(engine, result, query.method, request_id, parameters.skeleton)
-        total_ms = 1e3 * (time.monotonic() - arrival.at_s)
-        timings_ms = {"wait": wait_ms} | answer.timings_ms | {"total": total_ms}
-        answer = answer.model_copy(update={"timings_ms": rounded_timings(timings_ms)})
-        return answer, answer.model_dump_json().encode()
+        return poses_answer(engine, result, query.method, request_id, parameters.skeleton)
 
-    return work
+    return lambda: timed(estimate, arrival.at_s)
 
 
 def _observe(service: Service, answer: schemas.PosesAnswer) -> None:
