@@ -50,7 +50,8 @@ Float = NDArray[np.float64]
 LENGTHS = ("trunk", "hips", "shoulder", "head", "upper_arm", "forearm", "thigh", "shank")
 """Root to neck, hip to hip, neck to shoulder, neck to head top, and the four limb bones."""
 
-N_LEGS, N_UPPER, N_LENGTHS = 15, 23, len(LENGTHS)
+N_LEGS, N_LENGTHS = 15, len(LENGTHS)
+"""Numbers that describe the legs of a pose (:class:`BodyParts`), and a skeleton's lengths."""
 
 _LIMBS = (
     (R_SHOULDER, R_ELBOW, R_WRIST),

@@ -59,23 +59,35 @@ MM_PER_UNIT = {
     "centimetres": 10.0,
 }
 _PLAUSIBLE = (0.6, 1.3)
+"""Of ``ADULT_MM``: who is so large, children too, is believed to be given in mm."""
 _PLAUSIBLE_SCALED = (0.78, 1.25)
+"""The same where the unit has to be guessed; narrower, and no two units fit one size."""
 
 BONE_TOLERANCE = 0.3
+"""Of a bone's usual length."""
 MAX_SPEED_MM_S = 15_000.0
+"""About the root; see ``find_glitches``."""
 _MAX_LOST = 0.5
 
 _JUMP = 4.0
+"""How many times as far as 95% of the other steps the first frame is from the second."""
 _STRAIGHT = 0.97
+"""Shoulder to wrist, over the arm's bones."""
 
 _STANDS = 0.85
+"""Length of the mean direction from ankles to neck along the axis that is taken for up."""
 _BENT_MM = 30.0
+"""How far a clearly bent knee lies ahead of, or behind, the line from hip to ankle."""
 _MIN_BENT = 5
 _MOST = 0.9
+"""How many knees must be clearly bent, and the share of them that bends backwards."""
 
 _SHORT_FOREARM = 0.78
+"""Of the upper arm."""
 _SHORT_TRUNK = 0.55
+"""Of the leg."""
 _SHORT_HEAD = 0.25
+"""Neck to head top, of the trunk."""
 _ASYMMETRY = 0.15
 
 _RIGID = tuple(edge for edge in LSP14.edges if edge[0] != NECK)

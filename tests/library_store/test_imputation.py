@@ -55,3 +55,12 @@ def test_more_is_guessed_where_more_is_missing_and_in_larger_libraries() -> None
     assert_array_equal(numbers, [8, 16, 32])
     legs = weights_without(MASKS["both legs"])[0]
     assert_array_equal([n_guesses(n, legs) for n in (5_000, 200_000, 1_600_000)], [64, 64, 128])
+
+
+def test_a_joint_of_half_the_weight_or_more_is_taken_as_it_is(table: np.ndarray) -> None:
+    for weight, taken in ((0.5, True), (0.25, False)):
+        weights = np.ones(14)
+        weights[4] = weight
+        query = normalise(noisy_queries(table, 1)[0], weights)
+        off = np.abs(guesses(table, query, weights, 3) - describe(query)).max(axis=1)
+        assert (off < 1e-6).all() == taken
