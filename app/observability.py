@@ -97,7 +97,7 @@ class Metrics:
         )
         self._build = Info("posematch", "What is being served", registry=self.registry)
         self._networks = Info(
-            "posematch_model", "The networks in service", ["kind"], registry=self.registry
+            "posematch_model", "The networks in service", ["kind", "name"], registry=self.registry
         )
         self._of_requests: dict[tuple[str, str, int], tuple[Counter, Histogram]] = {}
         ProcessCollector(registry=self.registry)
@@ -143,9 +143,9 @@ class Metrics:
         """State which version, model and library are served."""
         self._build.info(labels)
 
-    def describe_network(self, kind: str, **labels: str) -> None:
+    def describe_network(self, kind: str, name: str, **labels: str) -> None:
         """State which network does what, and what runs it in which precision."""
-        self._networks.labels(kind).info(labels)
+        self._networks.labels(kind, name).info(labels)
 
 
 def server_timing(timings_ms: Mapping[str, float]) -> str:

@@ -67,6 +67,17 @@ def test_metrics(server: Server, photo: bytes) -> None:
     assert 'library="small ' in text
 
 
+def test_metrics_name_every_network_in_service(server: Server) -> None:
+    """Of a kind there may be two: one that lifts stated joints, one for found ones."""
+    info = InfoAnswer.model_validate_json(server.client.get("/v1/info").content)
+    said = re.findall(
+        r'^posematch_model_info\{kind="(.+?)",name="(.+?)".*version="(.+?)"\} 1.0$',
+        server.client.get("/metrics").text,
+        re.MULTILINE,
+    )
+    assert sorted(said) == sorted((it.kind, it.name, it.version) for it in info.networks)
+
+
 def test_log_lines_are_json_with_the_request_id(server: Server) -> None:
     server.client.get("/livez", headers={"X-Request-ID": "find-me-in-the-log"})
     deadline = time.monotonic() + 5  # the line is written after the answer
