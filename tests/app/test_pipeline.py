@@ -119,3 +119,15 @@ def test_depths_are_lifted_in_pixels_of_the_photo_as_it_was_sent(
     boxes.depths_px = None
     pipeline.estimate(photo, PhotoQuery(mirrored=mirrored))
     assert boxes.told[1].depths_px is None
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_given_box_comes_back_as_it_was_given_and_has_no_score(mirrored: bool) -> None:
+    boxes = Boxes("x" * 14)
+    pipeline = Pipeline(
+        boxes, boxes, cast(Lifter, boxes), max_pixels=1_000_000, decode_side_px=1000
+    )
+    box_px = (10.0, 5.0, 20.0, 40.0)
+    (person,) = pipeline.estimate(PHOTO, PhotoQuery(box_px=box_px, mirrored=mirrored)).people
+    assert person.box_px == box_px
+    assert person.score is None
