@@ -204,9 +204,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     halves = [errors.split() for errors in collect_errors(served, data, settings)]
     calibration = fit_sigma([half[0] for half in halves])
-    # What doubts add is evaluation.photo_sigma's; of the joints here nobody has any.
-    doubts = FUSION_SIGMA.person_doubt_mm, FUSION_SIGMA.joint_doubt_mm
-    print(replace(calibration, person_doubt_mm=doubts[0], joint_doubt_mm=doubts[1]))
+    # Of the joints here none is doubted or missing: what that adds others fit.
+    print(
+        replace(
+            FUSION_SIGMA, factors=calibration.factors, noise_mm_per_px=calibration.noise_mm_per_px
+        )
+    )
     report_coverage("fitted half", calibration, [half[0] for half in halves])
     report_coverage("other half", calibration, [half[1] for half in halves])
     _check_probability(served, data.half(1), settings)

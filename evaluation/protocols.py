@@ -47,6 +47,10 @@ class LiftingSet:
         """Every second person, from person 0 or 1."""
         return self._select(slice(which, None, 2))
 
+    def every(self, step: int) -> LiftingSet:
+        """One person in so many."""
+        return self._select(slice(None, None, step))
+
     def _select(self, people: slice) -> LiftingSet:
         return LiftingSet(
             self.name,

@@ -26,11 +26,13 @@ from rich.console import Console
 from rich.progress import track
 
 from library_store.skeleton import LSP14
+from library_store.upright import MOST_LEAN, lean_rad
 from models.card import WEIGHTS_DIR
 from models.errors import AnnotationError
 from models.person_detector import PersonBox
 from models.pose_estimator import PoseEstimator
-from models.training.dataset import decode_members, read_annotations
+from models.training.cut_short import end_px, seen_box
+from models.training.dataset import Image, decode_members, read_annotations
 from models.training.lifter_samples import (
     IN_MIRROR,
     Floats,
@@ -44,6 +46,8 @@ LEAST_CONFIDENCE, LEAST_JOINTS = 0.2, 6
 """Joints of less confidence count as missing, as in the service; people with fewer are left out."""
 SHIFT, GROWTH = 0.03, 0.08
 """Deviation of boxes from the true ones: of their place, in their longer side, and log size."""
+CUT_OFF = 0.35
+"""Share of those who are upright whose photo ends between their chest and their knees."""
 CANDIDATES = 512
 """Among so many of the known people, drawn at random, the one seen most alike is looked for."""
 CANDIDATES_IN_DEPTH = 2048
@@ -190,7 +194,7 @@ def _with_mirror(values: Floats) -> Floats:
 
 
 def find(renders: list[Path], estimator: PoseEstimator, rng: np.random.Generator) -> Mistakes:
-    """Have a network find the people of rendered sets, by boxes about as good as a detector's.
+    """Have a network find the people of rendered sets.
 
     Raises ``AnnotationError`` for sets without the truth in 3D, and when nobody is found.
     """
@@ -202,12 +206,10 @@ def find(renders: list[Path], estimator: PoseEstimator, rng: np.random.Generator
             if "joints_mm" not in record:
                 raise AnnotationError(f"{path} has no 3D truth: render it anew")
             truth_px = np.array(record["joints_px"], np.float64)
-            low, size = truth_px.min(0), np.ptp(truth_px, axis=0)
-            middle = low + size / 2 + rng.normal(0, SHIFT, 2) * size.max()
-            size = size * np.exp(rng.normal(0, GROWTH))
-            (x, y), (width, height) = middle - size / 2, size
-            box = PersonBox(x, y, width, height, score=1.0)
-            (found,) = estimator.estimate(images[record["image"]], [box])
+            photo, corners = _photo(images[record["image"]], truth_px, rng)
+            if corners is None:
+                continue
+            (found,) = estimator.estimate(photo, [_boxed(corners, rng)])
             if (found.belief >= LEAST_CONFIDENCE).sum() < LEAST_JOINTS:
                 continue
             centre, focal = np.array(record["principal_point_px"]), record["focal_length_px"]
@@ -220,6 +222,27 @@ def find(renders: list[Path], estimator: PoseEstimator, rng: np.random.Generator
     if not rows:
         raise AnnotationError(f"nobody is found in {', '.join(str(path) for path in renders)}")
     return Mistakes(*(np.array(part, np.float32) for part in zip(*rows, strict=True)))
+
+
+def _photo(
+    image: Image, truth_px: NDArray[np.float64], rng: np.random.Generator
+) -> tuple[Image, NDArray[np.float64] | None]:
+    """A rendered person's picture, cut off now and then, and the corners (4,) of who is left."""
+    corners = np.concatenate([truth_px.min(0), truth_px.max(0)])
+    if abs(lean_rad(truth_px)) > MOST_LEAN or rng.random() >= CUT_OFF:
+        return image, corners
+    height = int(np.clip(end_px(truth_px, rng), 1, len(image)))
+    photo = np.array([0.0, 0.0, image.shape[1], height])
+    return image[:height], seen_box(truth_px, np.ones(len(truth_px), np.bool_), photo)
+
+
+def _boxed(corners: NDArray[np.float64], rng: np.random.Generator) -> PersonBox:
+    """A box about as good as a detector's."""
+    size = corners[2:] - corners[:2]
+    middle = corners[:2] + size / 2 + rng.normal(0, SHIFT, 2) * size.max()
+    size = size * np.exp(rng.normal(0, GROWTH))
+    (x, y), (width, height) = middle - size / 2, size
+    return PersonBox(x, y, width, height, score=1.0)
 
 
 def main() -> None:

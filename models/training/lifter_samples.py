@@ -31,6 +31,10 @@ ELSEWHERE, NEAREST_MM, FARTHEST_MM = 0.12, 80.0, 550.0
 """Share of samples with a limb joint that is elsewhere, and how far at the person's distance."""
 IN_MIRROR = np.array([-1.0, 1.0, 1.0], np.float32)
 INCOMPLETE, MOST_MISSING, LIMB_MISSING = 0.15, 4, 0.75
+CUT_OFF, FEWEST_BEYOND, MOST_BEYOND = 0.15, 2, 8
+"""Share of people whom the photo's edge cuts off, and how many joints lie beyond it."""
+EDGE_ANYWHERE, EDGE_TURN_SD = 0.2, 0.3
+"""Share of these edges that are not the lower one; how far that is turned, in radians."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,7 @@ def draw(poses_mm: Floats, n: int, rng: np.random.Generator) -> Samples:
     root = _root_depth(seen)
     points = seen[..., :2] / seen[..., 2:]
     points = points + _noise_mm(n, rng) / root[:, None, None]
-    present = _present(n, rng)
+    present = _present(n, rng) * _within(points, rng)
     return samples_of(points, present, np.zeros_like(present), seen)
 
 
@@ -160,6 +164,25 @@ def _present(n: int, rng: np.random.Generator) -> Floats:
         limbs, any_joint = rng.choice(LIMB_JOINTS, len(rows)), rng.integers(N, size=len(rows))
         present[rows, np.where(rng.random(len(rows)) < LIMB_MISSING, limbs, any_joint)] = 0.0
     return present
+
+
+def _within(points: Floats, rng: np.random.Generator) -> Floats:
+    """Which joints of ``points`` (n, 14, 2) the photo's edge leaves, (n, 14): most often all."""
+    n = len(points)
+    within = np.ones((n, N), np.float32)
+    cut = np.flatnonzero(rng.random(n) < CUT_OFF)
+    anywhere = rng.random(len(cut)) < EDGE_ANYWHERE
+    turn = np.where(
+        anywhere,
+        rng.uniform(-np.pi, np.pi, len(cut)),
+        rng.normal(0.0, EDGE_TURN_SD, len(cut)),
+    )
+    outwards = np.stack([np.sin(turn), np.cos(turn)], 1)  # y is down
+    order = np.argsort(-np.einsum("njc,nc->nj", points[cut], outwards), axis=1)
+    beyond = rng.integers(FEWEST_BEYOND, MOST_BEYOND + 1, len(cut))
+    rows, ranks = np.nonzero(np.arange(N) < beyond[:, None])
+    within[cut[rows], order[rows, ranks]] = 0.0
+    return within
 
 
 def _onto_axis(points: Floats, present: Floats) -> tuple[Floats, Floats]:

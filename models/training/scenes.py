@@ -104,7 +104,7 @@ def scene_view(
     trust = np.full((size[1] // 8, size[0] // 8), 0.25 if len(scene.people) else 1.0, np.float32)
     boxes, inside = still_inside(moved(scene.people, matrix), size)
     score = scene.people[:, 4]
-    for box in boxes[inside & (score < SURE)]:
+    for box in boxes[~inside | (score < SURE)]:
         trust[cells(box)] = 0.0
     # A sure box says that its surroundings were looked at as well.
     return SceneSample(expose(image, rng), boxes[inside & (score >= SURE)], trust)
@@ -140,7 +140,7 @@ def portrait(crop: LabelledCrop, size: tuple[int, int], rng: np.random.Generator
     boxes, inside = still_inside(moved(box, matrix.astype(np.float32)), size)
     trust = np.full((size[1] // 8, size[0] // 8), 0.4, np.float32)
     for b in boxes:
-        trust[cells(b)] = 1.0
+        trust[cells(b)] = 1.0 if inside[0] else 0.0
     return SceneSample(expose(image, rng), boxes[inside], trust)
 
 

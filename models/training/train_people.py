@@ -20,6 +20,7 @@ from models.person_detector import decode, iou
 from models.training import loop
 from models.training.augment import worsen
 from models.training.crowds import calm_patches, crowd
+from models.training.cut_short import bust, can_be_cut, close_up, standing
 from models.training.cutout import whole
 from models.training.dataset import read_crops
 from models.training.network import PersonConfig, PersonNetwork
@@ -103,14 +104,18 @@ def main() -> None:
 
     crops, _ = read_crops(args.data, args.train, "")
     entire = [crop for crop in crops if whole(crop)]
+    cuttable = [crop for crop in crops if can_be_cut(crop)]
     train, dev = read_scenes(args.data / args.scenes, args.scenes_labels)
+    peopled = [scene for scene in train if len(standing(scene))]
     empty = [s.image for s in train if not len(s.people) or s.people[:, 4].max() < UNSURE]
     calm = empty + calm_patches(train, np.random.default_rng(args.seed))
     print(
         {
             "crops": len(crops),
             "whole": len(entire),
+            "to cut": len(cuttable),
             "scenes": len(train),
+            "with people who stand": len(peopled),
             "empty": len(empty),
             "calm": len(calm),
             "dev": len(dev),
@@ -127,11 +132,15 @@ def main() -> None:
 
     def upright(rng: np.random.Generator, size: tuple[int, int]) -> SceneSample:
         dice = rng.random()
-        if dice < 0.3:
+        if dice < 0.25:
             return scene_view(train[rng.integers(len(train))], size, rng)
-        if dice < 0.5:
+        if dice < 0.33:
+            return close_up(peopled[rng.integers(len(peopled))], size, rng)
+        if dice < 0.47:
             return portrait(crops[rng.integers(len(crops))], size, rng)
-        if dice < 0.75:
+        if dice < 0.63:
+            return bust(cuttable[rng.integers(len(cuttable))], calm, size, rng)
+        if dice < 0.83:
             return crowd(entire, calm, train, size, rng)
         return mosaic(crops, empty, size, rng)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,8 @@ import pytest
 from evaluation import cut_off
 from library_store.build import BuildSettings, build_library
 from library_store.prior import PosePrior
+from library_store.skeleton import L_ANKLE
+from models.training.dataset import LabelledCrop
 from tests.evaluation.rendered_set import write_set
 
 
@@ -36,7 +39,7 @@ def test_each_end_has_a_row_of_the_same_people(
 
 def test_whom_the_photo_shows_too_little_of_is_not_asked_for(tmp_path: Path) -> None:
     write_set(tmp_path / "set")
-    person = next(cut_off.standing(tmp_path / "set"))
+    person = next(cut_off.rendered(tmp_path / "set"))
     tally = cut_off.Tally()
     cut_off.look(None, person, person.joints_px[1, 1], tally)  # type: ignore[arg-type]
     assert not tally.answered
@@ -50,3 +53,33 @@ def test_sets_in_which_nobody_stands_are_named(
     monkeypatch.setattr(cut_off, "MOST_LEAN", 0.0)
     with pytest.raises(SystemExit, match="nobody stands upright"):
         cut_off.main(["--renders", str(tmp_path / "set")])
+
+
+def test_of_held_out_photos_those_are_cut_off_who_are_upright_and_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_set(tmp_path / "set")
+    renders = list(cut_off.rendered(tmp_path / "set"))[:2]
+    upside_down = replace(renders[0], joints_px=renders[0].joints_px[:, [0, 1]] * (1, -1))
+    without_ankle = replace(renders[0], known=np.arange(14) != L_ANKLE)
+    crops = [
+        LabelledCrop(
+            name="x",
+            group=0,
+            image=person.image,
+            joints_px=person.joints_px.astype(np.float32),
+            weight=person.known.astype(np.float32),
+            visible=np.ones(14, np.float32),
+            wild=False,
+        )
+        for person in (*renders, upside_down, without_ankle)
+    ]
+    monkeypatch.setattr(cut_off, "held_out_photos", lambda _: crops)
+    people = list(cut_off.photographed(tmp_path))
+    assert [person.upright for person in people] == [True, True, False, False]
+    np.testing.assert_array_equal(people[0].joints_px, renders[0].joints_px.astype(np.float32))
+
+
+def test_without_a_truth_in_3d_there_is_no_pa() -> None:
+    tally = cut_off.Tally(answered=[True, False], right=[np.ones(3), np.zeros(3)])
+    assert tally.row("the hips") == "| the hips | 2 | 50.0% | 50.0% | - |"

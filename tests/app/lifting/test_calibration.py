@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -33,7 +35,7 @@ def test_the_noise_found_widens_all_radii() -> None:
 
 
 def test_missing_joints_are_no_doubtful_ones() -> None:
-    """What is not seen contradicts nobody: the posterior's spread knows of it."""
+    """What is not seen contradicts nobody."""
     confidence = SURE.copy()
     confidence[[4, 7]] = 0.0
     np.testing.assert_array_equal(PLAIN(SPREAD_MM, 0.0, confidence), SPREAD_MM)
@@ -41,6 +43,17 @@ def test_missing_joints_are_no_doubtful_ones() -> None:
     np.testing.assert_allclose(
         PLAIN(SPREAD_MM, 0.0, confidence)[4], np.hypot(50.0, 300.0 * 0.6 / 12)
     )
+
+
+def test_what_is_missing_widens_every_radius() -> None:
+    growing = replace(PLAIN, missing_doubt=0.7)
+    np.testing.assert_array_equal(growing(SPREAD_MM, 0.0, SURE), SPREAD_MM)
+    confidence = SURE.copy()
+    confidence[7:] = 0.0
+    np.testing.assert_allclose(growing(SPREAD_MM, 0.0, confidence), 1.35 * SPREAD_MM)
+    confidence[0] = 0.5
+    plain = PLAIN(SPREAD_MM, 0.0, confidence)
+    np.testing.assert_allclose(growing(SPREAD_MM, 0.0, confidence), 1.35 * plain)
 
 
 def test_people_do_not_mix() -> None:

@@ -200,8 +200,11 @@ def test_who_reads_no_depths_gives_no_hints(poses: Floats) -> None:
         assert not samples.hint.any()
 
 
-def test_a_network_s_joints_are_kept_beside_the_truth(tmp_path: Path) -> None:
+def test_a_network_s_joints_are_kept_beside_the_truth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = rendered(tmp_path)
+    monkeypatch.setattr(lifter_mistakes, "CUT_OFF", 0.0)
     mistakes = find([folder], PoseEstimator("cpm"), np.random.default_rng(0))
     assert len(mistakes) == len(list(RENDERS.glob("*.jpg")))
     truth = mistakes.joints_mm[..., :2] / mistakes.joints_mm[..., 2:]
@@ -213,7 +216,25 @@ def test_a_network_s_joints_are_kept_beside_the_truth(tmp_path: Path) -> None:
     assert off[sure].mean() < off[~sure].mean()
 
 
-def test_depths_are_kept_relative_to_the_hips(tmp_path: Path) -> None:
+def test_of_who_is_cut_off_the_rest_is_kept_though_hardly_anything_says_where(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = rendered(tmp_path)
+    estimator = PoseEstimator("cpm")
+    monkeypatch.setattr(lifter_mistakes, "CUT_OFF", 0.0)
+    entire = find([folder], estimator, np.random.default_rng(0))
+    monkeypatch.setattr(lifter_mistakes, "CUT_OFF", 1.0)
+    cut = find([folder], estimator, np.random.default_rng(0))
+    assert 0.6 * len(entire) < len(cut) <= len(entire)
+    legs = [R_KNEE, L_KNEE, R_ANKLE, L_ANKLE]
+    assert cut.confidence[:, legs].mean() < entire.confidence[:, legs].mean() - 0.2
+    assert np.isin(cut.truth.sum((1, 2)), entire.truth.sum((1, 2))).all()
+
+
+def test_depths_are_kept_relative_to_the_hips(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lifter_mistakes, "CUT_OFF", 0.0)
     mistakes = find([rendered(tmp_path)], PoseEstimator("cpm"), np.random.default_rng(0))
     assert mistakes.have_depths
     sure = np.ones_like(mistakes.confidence)
