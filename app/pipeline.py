@@ -30,6 +30,7 @@ from library_store.errors import IndexUnavailableError
 from models.heatmaps import Joints2D
 from models.person_detector import PersonBox
 from models.presence import present
+from models.truncation import beyond_edge, stated_confidence
 
 Floats = npt.NDArray[np.float64]
 
@@ -228,15 +229,7 @@ class Pipeline:
         ]
         lifted = self._lift(observations, intrinsics, query, clock)
         people = tuple(
-            SeenPerson(
-                box_px=_box_to_image(box, seen),
-                score=None if query.box_px else box.score,
-                joints_px=found.positions_px,
-                present=np.ones(len(found.positions_px), bool),
-                confidence=found.confidence,
-                sigma_px=found.sigma_px,
-                lifted=person,
-            )
+            _answered(box, found, person, seen, stated_score=query.box_px is None)
             for box, found, person in zip(boxes, joints, lifted, strict=True)
         )
         if query.mirrored:
@@ -365,6 +358,29 @@ def _to_image(joints: Joints2D, photo: Photo) -> Joints2D:
         covariance_px2=joints.covariance_px2 * photo.reduction**2,
         sigma_px=None if joints.sigma_px is None else joints.sigma_px * photo.reduction,
         depths_px=None if joints.depths_px is None else joints.depths_px * photo.reduction,
+    )
+
+
+def _answered(
+    box: PersonBox,
+    found: Joints2D,
+    lifted: LiftedPerson | NotLiftable,
+    photo: Photo,
+    *,
+    stated_score: bool,
+) -> SeenPerson:
+    """What is said of one person: ``box`` is in the decoded photo's pixels, ``found`` in all."""
+    beyond = beyond_edge(found.positions_px, photo.width_px, photo.height_px)
+    if beyond.any() and "truncated" not in lifted.warnings:
+        lifted = replace(lifted, warnings=("truncated", *lifted.warnings))
+    return SeenPerson(
+        box_px=_box_to_image(box, photo),
+        score=box.score if stated_score else None,
+        joints_px=found.positions_px,
+        present=np.ones(len(found.positions_px), bool),
+        confidence=stated_confidence(found, beyond),
+        sigma_px=found.sigma_px,
+        lifted=lifted,
     )
 
 

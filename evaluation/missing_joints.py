@@ -4,7 +4,7 @@
 
 The same people with all their joints, then without some, at every noise level of ``--data``; the
 library and the network must not know them. *Covers* is the share of root-relative errors within
-``sigma_mm``; *before*, of what it would be without ``missing_doubt`` of ``app.lifting.calibration``.
+``sigma_mm``; *before*, without ``missing_doubt`` of ``app.lifting.calibration``.
 That is fitted on the even-numbered people, the table is of the odd-numbered ones.
 """
 

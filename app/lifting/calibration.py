@@ -1,6 +1,6 @@
 """From the spread of the fused posterior to a radius one can rely on.
 
-Per joint, ``sigma_mm = factor_j · (1 + m·s) · sqrt(spread² + (a·ν)² + (b·d)² + (c·d_j)²)`` with a,
+Per joint, ``sigma_mm = factor_j · sqrt((1 + m·s)²·(spread² + (a·ν)²) + (b·d)² + (c·d_j)²)`` with a,
 b, c and m the constants ``noise_mm_per_px``, ``person_doubt_mm``, ``joint_doubt_mm`` and
 ``missing_doubt``; ν the noise found in the 2D joints; d_j = 1 - confidence, the chance that a seen
 joint is elsewhere (0 for a missing one), d its mean over the seen joints, and s the share of the
@@ -56,17 +56,16 @@ class SigmaCalibration:
                 None when all are sure.
 
         """
-        growth: Floats | float = 1.0
         noise_mm = self.noise_mm_per_px * np.asarray(noise_px)[..., None]
         variance = spread_mm**2 + noise_mm**2
         if confidence is not None:
             seen = confidence > 0
+            growth = 1.0 + self.missing_doubt * (1.0 - seen.mean(-1, keepdims=True))
             doubt = np.where(seen, 1.0 - confidence, 0.0)
             of_person = doubt.sum(-1, keepdims=True) / np.maximum(seen.sum(-1, keepdims=True), 1)
-            variance = variance + (self.person_doubt_mm * of_person) ** 2
+            variance = growth**2 * variance + (self.person_doubt_mm * of_person) ** 2
             variance = variance + (self.joint_doubt_mm * doubt) ** 2
-            growth = 1.0 + self.missing_doubt * (1.0 - seen.mean(-1, keepdims=True))
-        return np.array(self.factors) * growth * np.sqrt(variance)
+        return np.array(self.factors) * np.sqrt(variance)
 
 
 FUSION_SIGMA = SigmaCalibration(

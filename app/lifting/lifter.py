@@ -31,14 +31,10 @@ from app.lifting.types import (
 from app.lifting.warp import warp_perspective, warp_weak_perspective
 from library_store.library import Library
 from library_store.skeleton import (
-    L_ANKLE,
     L_HIP,
-    L_KNEE,
     L_SHOULDER,
     NECK,
-    R_ANKLE,
     R_HIP,
-    R_KNEE,
     R_SHOULDER,
 )
 from models.pose_lifter import PoseLifter
@@ -49,7 +45,6 @@ MIN_TRUNK_JOINTS = 2
 """Of shoulders, hips and neck: without them limbs hang on nothing."""
 TRUNK = (NECK, R_SHOULDER, L_SHOULDER, R_HIP, L_HIP)
 _TRUNK_JOINTS = np.array(TRUNK)
-_LEGS = np.array([R_HIP, R_KNEE, R_ANKLE, L_HIP, L_KNEE, L_ANKLE])
 MIN_EXTENT_PX = 8.0
 """Larger side of the joints' bounding box, pixels of the photo."""
 MIN_BREADTH = 0.02
@@ -326,9 +321,7 @@ class Lifter:
         if covariance is not None:
             covariance = covariance * ensemble.px_per_unit**2
         learned = None
-        # The network says where joints are about the hips. Of portraits it knows too little: with
-        # nothing from the hips down, joints err by a half more than the neighbours' do.
-        if self._network is not None and (confidence[_LEGS] > 0).any():
+        if self._network is not None:
             learned = self._network.lift(view.points, confidence, depths)
         return fuse(ensemble, view.points, confidence, covariance, self._settings.fusion, learned)
 

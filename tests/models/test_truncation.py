@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 
 from evaluation.renders import read_renders
+from models.heatmaps import Joints2D
 from models.person_detector import PersonBox
 from models.pose_estimator import PoseEstimator
-from models.truncation import GROWTHS, whole
+from models.truncation import BEYOND_EDGE, GROWTHS, beyond_edge, stated_confidence, whole
 
 WIDTH, HEIGHT = 400, 300
 CLEARLY = GROWTHS[-1][0]
@@ -26,6 +27,19 @@ def test_who_is_seen_clearly_or_ends_within_the_photo_stays() -> None:
     assert whole(box(5, 100, 60, 90), WIDTH, HEIGHT, 0.1) is None, "tall: no side is missing"
     filling = box(5, 400, 390, 80)
     assert whole(filling, WIDTH, 1000, 0.1) is None, "cut off on both sides, or not at all"
+
+
+def test_a_joint_beyond_the_edge_is_stated_with_less_confidence_than_lifting_goes_by() -> None:
+    at = np.array([[0, 0], [-0.4, 299.4], [399.6, 10], [50, 299.6], [-0.6, 20], [30, -7]], float)
+    beyond = beyond_edge(at, WIDTH, HEIGHT)
+    assert beyond.tolist() == [False, False, True, True, True, True]
+    flat, half = np.zeros((6, 2, 2)), np.full(6, 0.5)
+    joints = Joints2D(at, flat, confidence=half, sigma_px=None, peak=np.ones(6))
+    stated = stated_confidence(joints, beyond)
+    assert stated is not None
+    np.testing.assert_allclose(stated, np.where(beyond, BEYOND_EDGE * 0.5, 0.5))
+    np.testing.assert_array_equal(joints.belief, half)
+    assert stated_confidence(Joints2D(at, flat, None, None, np.ones(6)), beyond) is None
 
 
 @pytest.mark.parametrize(

@@ -52,8 +52,8 @@ def test_what_is_missing_widens_every_radius() -> None:
     confidence[7:] = 0.0
     np.testing.assert_allclose(growing(SPREAD_MM, 0.0, confidence), 1.35 * SPREAD_MM)
     confidence[0] = 0.5
-    plain = PLAIN(SPREAD_MM, 0.0, confidence)
-    np.testing.assert_allclose(growing(SPREAD_MM, 0.0, confidence), 1.35 * plain)
+    plain = PLAIN(1.35 * SPREAD_MM, 0.0, confidence)
+    np.testing.assert_allclose(growing(SPREAD_MM, 0.0, confidence), plain)
 
 
 def test_people_do_not_mix() -> None:
