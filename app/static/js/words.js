@@ -48,7 +48,7 @@ const WARNINGS = {
     "Nothing says how far the photo was zoomed, so a field of view of 55° was assumed: the distance " +
     `(${metres(Math.hypot(...person.root_mm))}) is only as good as that. Options can state it.`,
   truncated: () =>
-    "Not everything of this person is seen. The joints that are missing come from similar poses, with a larger uncertainty.",
+    "Not everything of this person is seen. What is missing is guessed from similar poses, with a larger uncertainty.",
   inconsistent_joints: () =>
     "Some 2D joints contradict the others as a human pose; they were set aside and placed from the rest.",
   ambiguous_depth: () =>
