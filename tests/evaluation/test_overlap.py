@@ -5,7 +5,7 @@ import numpy as np
 from evaluation.overlap import Pair, alone, pair, pairs_of, score
 from library_store.skeleton import LSP14
 from models.training.dataset import LabelledCrop
-from tests.models.training.test_crowds import standing
+from tests.models.training.crops import standing
 
 
 def some_pairs(n: int = 20) -> list[Pair]:

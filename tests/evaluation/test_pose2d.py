@@ -8,7 +8,7 @@ import numpy as np
 from evaluation.pose2d import LSPET_SIDES, find, put_right, score, table
 from library_store.skeleton import LSP14
 from models.training.dataset import LabelledCrop
-from tests.models.training.test_crowds import standing
+from tests.models.training.crops import standing
 
 MIRROR = list(LSP14.mirror)
 
