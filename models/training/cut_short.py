@@ -36,7 +36,7 @@ LEAST_ASPECT, LEAST_TALL_PX = 1.7, 90.0
 """Boxes of scenes that are taller are of people who stand; smaller ones are not worth enlarging."""
 SMALLEST, LARGEST = 0.35, 1.05
 """Height of what is left of the person, of the photo's."""
-FRAMED, MOST_FRAME = 0.4, 0.2
+FRAMED, MOST_FRAME = 0.25, 0.2
 """Share of the portraits with black beyond the photo, and how far from each side it may reach."""
 OTHER_GROUND = 0.35
 """Share of the portraits that are set before another background."""

@@ -135,7 +135,7 @@ def portrait(crop: LabelledCrop, size: tuple[int, int], rng: np.random.Generator
     at = np.array(size) * rng.uniform(0.35, 0.65, 2)
     matrix = np.array([[-scale if flip else scale, 0, 0], [0, scale, 0]])
     matrix[:, 2] = at - mid * (-1 if flip else 1, 1)
-    beyond = cv2.BORDER_CONSTANT if rng.random() < 0.4 else cv2.BORDER_REPLICATE
+    beyond = cv2.BORDER_CONSTANT if rng.random() < 0.5 else cv2.BORDER_REPLICATE
     image = cv2.warpAffine(crop.image, matrix, size, borderMode=beyond)
     boxes, inside = still_inside(moved(box, matrix.astype(np.float32)), size)
     trust = np.full((size[1] // 8, size[0] // 8), 0.4, np.float32)

@@ -132,13 +132,13 @@ def main() -> None:
 
     def upright(rng: np.random.Generator, size: tuple[int, int]) -> SceneSample:
         dice = rng.random()
-        if dice < 0.25:
+        if dice < 0.22:
             return scene_view(train[rng.integers(len(train))], size, rng)
-        if dice < 0.33:
+        if dice < 0.28:
             return close_up(peopled[rng.integers(len(peopled))], size, rng)
-        if dice < 0.47:
+        if dice < 0.54:
             return portrait(crops[rng.integers(len(crops))], size, rng)
-        if dice < 0.63:
+        if dice < 0.66:
             return bust(cuttable[rng.integers(len(cuttable))], calm, size, rng)
         if dice < 0.83:
             return crowd(entire, calm, train, size, rng)
