@@ -372,7 +372,9 @@ def _answered(
     """What is said of one person: ``box`` is in the decoded photo's pixels, ``found`` in all."""
     beyond = beyond_edge(found.positions_px, photo.width_px, photo.height_px)
     if beyond.any() and "truncated" not in lifted.warnings:
-        lifted = replace(lifted, warnings=("truncated", *lifted.warnings))
+        focal = tuple(it for it in lifted.warnings if it == "assumed_focal")
+        others = lifted.warnings[len(focal) :]
+        lifted = replace(lifted, warnings=(*focal, "truncated", *others))
     return SeenPerson(
         box_px=_box_to_image(box, photo),
         score=box.score if stated_score else None,

@@ -18,7 +18,7 @@ nothing of body size, which a photo does not show, and covers less of people of 
 given subject height, which scales the radius with the answer.
 
 b and c (``evaluation.photo_sigma``): 600 rendered people in poses of the same subjects, turned and
-tumbled, their joints found by the shipped CPM. On 590 others it covers 65%; 37% without b and c.
+tumbled, their joints found by the shipped CPM. On 590 others it covers 66%; 39% without b and c.
 
 m (``evaluation.missing_joints``): people of those five subjects without ankles, hips, legs, arms,
 one side, and so on; without m the radius covers half of the errors of who is stated down to the
