@@ -94,6 +94,14 @@ def _zoom(photo: Floats, tall_px: float, rng: np.random.Generator) -> float:
     return share * float(photo[3] - photo[1]) / max(tall_px, 1.0)
 
 
+def _shift(
+    photo: Floats, end: tuple[float, float], scale: float, flip: bool, rng: np.random.Generator
+) -> Floats:
+    """Where ``place`` must put an image for its point ``end`` to lie on the photo's lower edge."""
+    x = photo[0] + rng.uniform(0.1, 0.9) * (photo[2] - photo[0])
+    return np.array([x - scale * end[0] * (-1 if flip else 1), photo[3] - scale * end[1]])
+
+
 def bust(
     crop: LabelledCrop, backs: list[Image], size: tuple[int, int], rng: np.random.Generator
 ) -> SceneSample:
@@ -108,9 +116,8 @@ def bust(
     end = min(end_px(joints, rng), lowest)
     scale = _zoom(photo, end - float(joints[known, 1].min()), rng)
     flip = bool(rng.random() < 0.5)
-    x = float(photo[0]) + rng.uniform(0.1, 0.9) * float(photo[2] - photo[0])
-    middle = float(joints[[NECK, R_HIP, L_HIP], 0] @ (0.5, 0.25, 0.25)) * scale
-    shift = np.array([x + middle if flip else x - middle, float(photo[3]) - scale * end])
+    middle = float(joints[[NECK, R_HIP, L_HIP], 0] @ (0.5, 0.25, 0.25))
+    shift = _shift(photo, (middle, end), scale, flip, rng)
     matrix = np.array([[-scale if flip else scale, 0, shift[0]], [0, scale, shift[1]]])
     trust = np.full((size[1] // 8, size[0] // 8), 0.4, np.float32)
     if whole(crop) and rng.random() < OTHER_GROUND:
@@ -144,9 +151,7 @@ def close_up(scene: LabelledScene, size: tuple[int, int], rng: np.random.Generat
     tall = (y1 - y0) * float(rng.uniform(LEAST_SHARE, MOST_SHARE))
     scale = _zoom(photo, tall, rng)
     flip = bool(rng.random() < 0.5)
-    x = float(photo[0]) + rng.uniform(0.1, 0.9) * float(photo[2] - photo[0])
-    middle = 0.5 * (x0 + x1) * scale
-    shift = np.array([x + middle if flip else x - middle, float(photo[3]) - scale * (y0 + tall)])
+    shift = _shift(photo, (0.5 * (x0 + x1), y0 + tall), scale, flip, rng)
     image, matrix = place(scene.image, size, scale, shift, flip, rng.uniform(0, 255, 3))
     boxes = moved(scene.people, matrix) - np.tile(photo[:2], 2).astype(np.float32)
     shown, inside = still_inside(boxes, (int(photo[2] - photo[0]), int(photo[3] - photo[1])))

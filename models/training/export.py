@@ -155,7 +155,8 @@ def person_card(network: PersonNetwork, name: str, version: str, size: int) -> M
         licence="Apache-2.0 (weights); the training images keep their own terms",
         limits=[
             "people smaller than a fifteenth of the photo's longer side are often missed",
-            "boxes are of the joints, not of hair, clothes or things held",
+            "boxes are of the joints, not of hair, clothes or things held; "
+            "of somebody cut off they end where the photo does",
             RESEARCH,
         ],
         measured={},
