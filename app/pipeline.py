@@ -218,19 +218,31 @@ class Pipeline:
         )
         clock.lap("decode")
         boxes, joints = self._find(seen, query, clock)
+        beyond = [
+            beyond_edge(found.positions_px, photo.width_px, photo.height_px) for found in joints
+        ]
         observations = [
             Observation(
                 joints_px=found.positions_px,
                 confidence=found.belief,
                 covariance_px2=found.covariance_px2,
                 depths_px=found.depths_px,
+                truncated=bool(outside.any()),
             )
-            for found in joints
+            for found, outside in zip(joints, beyond, strict=True)
         ]
         lifted = self._lift(observations, intrinsics, query, clock)
         people = tuple(
-            _answered(box, found, person, seen, stated_score=query.box_px is None)
-            for box, found, person in zip(boxes, joints, lifted, strict=True)
+            SeenPerson(
+                box_px=_box_to_image(box, seen),
+                score=None if query.box_px else box.score,
+                joints_px=found.positions_px,
+                present=np.ones(len(found.positions_px), bool),
+                confidence=stated_confidence(found, outside),
+                sigma_px=found.sigma_px,
+                lifted=person,
+            )
+            for box, found, outside, person in zip(boxes, joints, beyond, lifted, strict=True)
         )
         if query.mirrored:
             people = tuple(_mirror(person, photo.width_px) for person in people)
@@ -358,31 +370,6 @@ def _to_image(joints: Joints2D, photo: Photo) -> Joints2D:
         covariance_px2=joints.covariance_px2 * photo.reduction**2,
         sigma_px=None if joints.sigma_px is None else joints.sigma_px * photo.reduction,
         depths_px=None if joints.depths_px is None else joints.depths_px * photo.reduction,
-    )
-
-
-def _answered(
-    box: PersonBox,
-    found: Joints2D,
-    lifted: LiftedPerson | NotLiftable,
-    photo: Photo,
-    *,
-    stated_score: bool,
-) -> SeenPerson:
-    """What is said of one person: ``box`` is in the decoded photo's pixels, ``found`` in all."""
-    beyond = beyond_edge(found.positions_px, photo.width_px, photo.height_px)
-    if beyond.any() and "truncated" not in lifted.warnings:
-        focal = tuple(it for it in lifted.warnings if it == "assumed_focal")
-        others = lifted.warnings[len(focal) :]
-        lifted = replace(lifted, warnings=(*focal, "truncated", *others))
-    return SeenPerson(
-        box_px=_box_to_image(box, photo),
-        score=box.score if stated_score else None,
-        joints_px=found.positions_px,
-        present=np.ones(len(found.positions_px), bool),
-        confidence=stated_confidence(found, beyond),
-        sigma_px=found.sigma_px,
-        lifted=lifted,
     )
 
 

@@ -23,36 +23,26 @@ from evaluation.networks import add_network_option
 from evaluation.photo_sigma import Answers, Seen, lift
 from evaluation.progress import followed
 from evaluation.protocols import LiftingSet, clean, load_lifting_set
-from library_store.skeleton import (
-    HEAD_TOP,
-    L_ANKLE,
-    L_ELBOW,
-    L_HIP,
-    L_KNEE,
-    L_SHOULDER,
-    L_WRIST,
-    LSP14,
-    NECK,
-    R_ANKLE,
-    R_ELBOW,
-    R_HIP,
-    R_KNEE,
-    R_WRIST,
-)
+from library_store.skeleton import LSP14
 
-_LEGS = (R_KNEE, R_ANKLE, L_KNEE, L_ANKLE)
+
+def _joints(names: str, sides: str = "rl") -> tuple[int, ...]:
+    """Joints of these ``sides`` by their names without them."""
+    return tuple(LSP14.index(f"{side}_{name}") for name in names.split() for side in sides)
+
+
 MISSING: dict[str, tuple[int, ...]] = {
     "nothing": (),
-    "a wrist": (R_WRIST,),
-    "the head": (HEAD_TOP, NECK),
-    "the ankles": (R_ANKLE, L_ANKLE),
-    "a leg": (L_KNEE, L_ANKLE),
-    "the hips": (R_HIP, L_HIP),
-    "the legs": _LEGS,
-    "the arms": (R_ELBOW, R_WRIST, L_ELBOW, L_WRIST),
-    "hips and legs": (R_HIP, L_HIP, *_LEGS),
-    "one side": (L_SHOULDER, L_ELBOW, L_WRIST, L_HIP, L_KNEE, L_ANKLE),
-    "hips, legs and wrists": (R_HIP, L_HIP, *_LEGS, R_WRIST, L_WRIST),
+    "a wrist": _joints("wrist", "r"),
+    "the head": (LSP14.index("head_top"), LSP14.index("neck")),
+    "the ankles": _joints("ankle"),
+    "a leg": _joints("knee ankle", "l"),
+    "the hips": _joints("hip"),
+    "the legs": _joints("knee ankle"),
+    "the arms": _joints("elbow wrist"),
+    "hips and legs": _joints("hip knee ankle"),
+    "one side": _joints("shoulder elbow wrist hip knee ankle", "l"),
+    "hips, legs and wrists": _joints("hip knee ankle wrist"),
 }
 DOUBTS = tuple(round(0.1 * tenths, 1) for tenths in range(16))
 """Of these the fit chooses."""

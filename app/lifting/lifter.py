@@ -205,7 +205,8 @@ class Lifter:
         confidence = np.where(
             person.confidence >= self._settings.least_confidence, person.confidence, 0.0
         )
-        truncated = ("truncated",) if (confidence == 0).any() else ()
+        cut_off = person.truncated or (confidence == 0).any()
+        truncated = ("truncated",) if cut_off else ()
         refusal = _why_not_liftable(person.joints_px, confidence)
         if refusal is not None:
             return NotLiftable(refusal, truncated)

@@ -28,7 +28,8 @@ class Observation:
     ignored and may be NaN); ``covariance_px2`` (14, 2, 2) px², or None when unknown: the noise is
     then estimated from the joints themselves; ``depths_px`` (14,) how much farther from the camera
     than the hip midpoint each joint is by what the picture shows of it, in pixels at the hips'
-    distance, ``(z / z_root - 1) * focal_length_px``, or None when unknown. ``ValueError`` on wrong
+    distance, ``(z / z_root - 1) * focal_length_px``, or None when unknown; ``truncated`` when the
+    photo cuts the person off and what lies beyond its edge is guessed. ``ValueError`` on wrong
     shapes, on confidences outside [0, 1] and on present joints that are not finite.
     """
 
@@ -36,6 +37,7 @@ class Observation:
     confidence: Floats
     covariance_px2: Floats | None = None
     depths_px: Floats | None = None
+    truncated: bool = False
 
     def __post_init__(self) -> None:
         n = LSP14.n_joints

@@ -28,7 +28,6 @@ class Boxes:
     close: bool = False
     asked: list[int] = field(default_factory=list)
     depths_px: NDArray[np.float64] | None = None
-    warnings: tuple[str, ...] = ()
     told: list[Observation] = field(default_factory=list)
 
     def detect(self, image: NDArray[np.uint8], max_people: int) -> list[PersonBox]:
@@ -61,7 +60,7 @@ class Boxes:
 
     def lift(self, observations: Sequence[Observation], *_: Any, **__: Any) -> list[NotLiftable]:
         self.told.extend(observations)
-        return [NotLiftable("too few joints", self.warnings)] * len(observations)
+        return [NotLiftable("too few joints")] * len(observations)
 
 
 @pytest.mark.parametrize(
@@ -136,17 +135,16 @@ def test_a_given_box_comes_back_as_it_was_given_and_has_no_score(mirrored: bool)
 
 
 def test_joints_beyond_the_photo_are_stated_with_less_confidence_and_warned_of() -> None:
-    boxes = Boxes("x", warnings=("assumed_focal", "ambiguous_depth"))
+    boxes = Boxes("x")
     pipeline = Pipeline(boxes, boxes, cast("Lifter", boxes), max_pixels=10**6, decode_side_px=448)
     (whole,) = pipeline.estimate(PHOTO, PhotoQuery()).people
     assert whole.confidence is not None
     assert (whole.confidence == 0.9).all()
-    assert whole.lifted.warnings == boxes.warnings
     low = cv2.imencode(".png", np.zeros((10, 400, 3), np.uint8))[1].tobytes()
     (cut,) = pipeline.estimate(low, PhotoQuery()).people
     beyond = cut.joints_px[:, 1] > 9.5
     assert 2 < beyond.sum() < 12
     assert cut.confidence is not None
     np.testing.assert_allclose(cut.confidence, np.where(beyond, BEYOND_EDGE * 0.9, 0.9))
-    assert cut.lifted.warnings == ("assumed_focal", "truncated", "ambiguous_depth")
+    assert [told.truncated for told in boxes.told] == [False, True]
     assert (boxes.told[-1].confidence == 0.9).all(), "lifting goes by what the network believes"

@@ -166,6 +166,17 @@ def test_twenty_degrees_off_axis_costs_nothing(lifter: Lifter, people: People) -
     assert abs(errors[1] - errors[0]) < 2.0
 
 
+def test_who_is_cut_off_is_warned_of_though_nothing_is_missing(
+    lifter: Lifter, people: People
+) -> None:
+    whole = observe(people.joints_px[7])
+    cut = lift_one(lifter, replace(whole, truncated=True))
+    plain = lift_one(lifter, whole)
+    assert "truncated" not in plain.warnings
+    assert cut.warnings == ("truncated", *plain.warnings)
+    np.testing.assert_array_equal(cut.joints_3d_mm, plain.joints_3d_mm)
+
+
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("missing", [(), (8, 9, 10, 11, 12, 13), (0, 1, 2, 3, 4, 5, 6, 7)])
 def test_a_photo_on_its_side_costs_nothing(
