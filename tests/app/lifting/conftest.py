@@ -17,6 +17,7 @@ from library_store.library import Library, load
 from library_store.prior import PosePrior
 
 INTRINSICS = Intrinsics(1150.0, (320.0, 240.0), "request")
+METHODS: tuple[Method, ...] = ("fusion", "paper")
 
 
 @pytest.fixture(scope="session")
@@ -90,3 +91,20 @@ def lift_one(
     )
     assert isinstance(person, LiftedPerson)
     return person
+
+
+def same(a: LiftedPerson, b: LiftedPerson) -> bool:
+    """Whether two people are answered with the same bytes."""
+
+    def answer(person: LiftedPerson) -> tuple[object, ...]:
+        sigma = None if person.sigma_mm is None else person.sigma_mm.tobytes()
+        exemplar = person.exemplar
+        return (
+            person.joints_3d_mm.tobytes(),
+            person.warped_mm.tobytes(),
+            (exemplar.exemplar_id, exemplar.probability, exemplar.rotation.tobytes()),
+            sigma,
+            person.warnings,
+        )
+
+    return answer(a) == answer(b)
