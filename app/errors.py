@@ -249,5 +249,5 @@ class NotReadyError(RequestError):
     title = "Not ready"
     closes_connection = True
 
-    def __init__(self, detail: str, retry_after_s: int = 1) -> None:
-        super().__init__(detail, headers={"Retry-After": str(retry_after_s)})
+    def __init__(self, detail: str) -> None:
+        super().__init__(detail, headers={"Retry-After": "1"})

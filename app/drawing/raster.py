@@ -23,6 +23,7 @@ _SHIFT = 4
 """Binary digits after the point of OpenCV's coordinates."""
 _HERSHEY_PX = 22.0
 """Height of OpenCV's plain font at scale 1."""
+_DASH_PX = 6.0
 
 
 def to_pixels(picture: Picture) -> Pixels:
@@ -84,12 +85,12 @@ def _segments(points: Floats) -> list[tuple[Floats, Floats]]:
     return list(pairwise(points))
 
 
-def _dashes(stroke: Stroke, dash: float = 6.0) -> list[tuple[Floats, Floats]]:
+def _dashes(stroke: Stroke) -> list[tuple[Floats, Floats]]:
     pieces = []
     for start, end in _segments(stroke.points):
         length = float(np.linalg.norm(end - start))
-        steps = np.arange(0.0, length, 2 * dash) / max(length, 1e-9)
-        stops = np.minimum(steps + dash / max(length, 1e-9), 1.0)
+        steps = np.arange(0.0, length, 2 * _DASH_PX) / max(length, 1e-9)
+        stops = np.minimum(steps + _DASH_PX / max(length, 1e-9), 1.0)
         pieces += [
             (start + (end - start) * a, start + (end - start) * b)
             for a, b in zip(steps, stops, strict=True)

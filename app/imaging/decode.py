@@ -36,8 +36,8 @@ _TO_UPRIGHT = {
     7: (True, True, True),
     8: (True, False, True),
 }
-
-
+BOX_SIDE_PX = 384
+"""Pixels kept of a given box, along its longer side: more than a pose network sees of it."""
 _STRIP_ROWS = 64
 
 
@@ -76,12 +76,11 @@ def decode_photo(
     max_pixels: int,
     side_px: int,
     box_px: tuple[float, float, float, float] | None = None,
-    box_side_px: int = 384,
 ) -> Photo:
     """Decode ``data`` (JPEG, PNG, WebP, HEIC with its extra) and turn it upright.
 
     A JPEG is decoded at 1/2, 1/4 or 1/8 as long as its longer side keeps ``side_px`` pixels, or,
-    when the client says where the person is, as long as that box keeps ``box_side_px``.
+    when the client says where the person is, as long as that box keeps :data:`BOX_SIDE_PX`.
     Transparent pixels are shown on white, as viewers do; of an animation the first frame is taken.
 
     Raises ``UnsupportedImageTypeError``, ``TooManyPixelsError`` (before decoding) or
@@ -97,7 +96,7 @@ def decode_photo(
     exif = read_exif(header.exif)
     long_side, wanted = max(header.width_px, header.height_px), side_px
     if box_px is not None:
-        long_side, wanted = int(max(box_px[2:])), box_side_px
+        long_side, wanted = int(max(box_px[2:])), BOX_SIDE_PX
     reduction = _reduction(header, long_side, wanted)
     pixels = _decode(data, header, reduction)
     width, height = header.width_px, header.height_px

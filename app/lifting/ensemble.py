@@ -24,7 +24,7 @@ from app.lifting.posterior import STANDARD_PX_PER_MM
 from app.lifting.proportions import PROPORTION_DIRECTIONS
 from app.lifting.resection import LEAST_EXTENT_MM, NEAREST_TO_EXTENT
 from app.lifting.stature import STATURE_SEGMENTS, STATURE_SHARES
-from library_store.skeleton import L_HIP, LSP14, R_HIP, Skeleton
+from library_store.skeleton import L_HIP, LSP14, R_HIP
 
 _TYPICAL = 16
 """Neighbours whose mean shows what proportions do: they need not be told apart for that."""
@@ -179,11 +179,11 @@ def _contiguous(values: Floats) -> Floats:
 
 
 @cache
-def localisation(bones: float, skeleton: Skeleton = LSP14) -> Floats:
+def localisation(bones: float) -> Floats:
     """(J, J) factors exp(-d / bones), d the bones between two joints; positive definite."""
-    n = skeleton.n_joints
+    n = LSP14.n_joints
     distance = np.where(np.eye(n, dtype=bool), 0.0, np.inf)
-    for parent, child in skeleton.edges:
+    for parent, child in LSP14.edges:
         distance[parent, child] = distance[child, parent] = 1.0
     for via in range(n):
         distance = np.minimum(distance, distance[:, via, None] + distance[None, via, :])

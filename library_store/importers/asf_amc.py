@@ -94,9 +94,9 @@ class SkeletonFile:
     degrees_per_angle: float
 
 
-def read(path: Path, *, skeleton: Path | None = None) -> Clip:
-    """The clip of an AMC file; ``skeleton`` is its ASF, by default the one in the same folder."""
-    asf = read_asf(skeleton or find_skeleton(path))
+def read(path: Path) -> Clip:
+    """The clip of an AMC file, by the ASF in the same folder."""
+    asf = read_asf(find_skeleton(path))
     frames, motion = read_amc(path, asf)
     ends = bone_ends(asf, motion)
     missing = [name for name in JOINTS if name not in ends]
