@@ -40,7 +40,7 @@ class Metrics:
         )
         self.request_seconds = Histogram(
             "posematch_request_seconds",
-            "From the request's first byte to the answer's last",
+            "From a request's head to the end of its answer",
             ["route"],
             buckets=_SECONDS,
             registry=self.registry,
@@ -54,13 +54,13 @@ class Metrics:
         )
         self.refused = Counter(
             "posematch_refused",
-            "Requests refused for want of capacity",
+            "Requests refused with a 503 or, over their key's quota, a 429",
             ["reason"],
             registry=self.registry,
         )
         self.abandoned = Counter(
             "posematch_abandoned",
-            "Requests whose client left before their turn",
+            "Requests given up because their client had left",
             registry=self.registry,
         )
         self.people = Histogram(

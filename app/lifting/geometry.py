@@ -96,7 +96,7 @@ def centre_view(
     """Turn the camera onto the weighted centre of a person's joints; who leans far, upright.
 
     Args:
-        joints_px: (J, 2) pixels; rows of weight 0 may hold anything finite.
+        joints_px: (J, 2) pixels; rows of weight 0 may hold anything, NaN too.
         weights: (J,) in [0, 1], not all 0.
         covariance_px2: (J, 2, 2) px² or None; carried over to first order.
         focal_length_px: focal length.

@@ -3,8 +3,8 @@
 ::
 
     ClientError
-    ├── RefusedError       the service answered, with an error
-    └── UnreachableError   there was no answer, or none that can be read
+    ├── RefusedError       the service answered, with an error or with what is no JSON
+    └── UnreachableError   there was no answer, it broke off, or the request cannot be sent
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ class ClientError(Exception):
 
 
 class RefusedError(ClientError):
-    """The service, or a proxy before it, answered with an error.
+    """The service, or a proxy before it, answered with an error, or with what is no JSON.
 
     ``problem`` is its problem+json (RFC 9457), empty when it sent none; ``slug`` the stable part
     of the problem's type, such as ``"unsupported-image-type"``; ``retry_after_s`` what it asked

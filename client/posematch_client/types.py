@@ -145,8 +145,9 @@ class InfoAnswer(TypedDict):
 class Joint2D(TypedDict):
     """A joint in the photo.
 
-    ``confidence`` is the calibrated probability that it is within 0.2 torso lengths of the truth;
-    ``sigma_px`` the radius that holds 68% of its errors.
+    ``confidence`` is the calibrated probability that it is within 0.2 torso lengths of the truth
+    (of joints given to /v1/lift, what was stated); ``sigma_px`` the radius that holds 68% of its
+    errors.
     """
 
     confidence: float | None
