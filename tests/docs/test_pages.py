@@ -10,11 +10,13 @@ from pathlib import Path
 
 import pytest
 import typer
+from prometheus_client import generate_latest
 
 from app.cli import cli
 from app.errors import RequestError
 from app.licences_table import END, START, renewed
 from app.main import create_app
+from app.observability import Metrics
 from app.settings import ENV_PREFIX, Settings
 from models.providers import PACKAGES
 
@@ -125,6 +127,16 @@ def test_every_posematch_command_has_these_options(page: Path) -> None:
                 break
             if word.startswith("--"):
                 assert word.partition("=")[0] in known, line
+
+
+def test_every_metric_is_documented_and_no_other() -> None:
+    text = (ROOT / "docs" / "operations.md").read_text()
+    watch = text.partition("## What to watch")[2].partition("\n## ")[0]
+    served = generate_latest(Metrics().registry).decode()
+    metrics = set(re.findall(r"^# TYPE (posematch\w*) ", served, re.MULTILINE))
+    assert set(re.findall(r"`(posematch_\w+)`", watch)) == {
+        name for name in metrics if not name.endswith("_created")
+    }
 
 
 def test_the_table_of_licences_is_that_of_the_lock_file() -> None:
