@@ -39,7 +39,7 @@ def compiled() -> ctypes.CDLL:
     array, number, real = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
     library.posematch_resect.argtypes = [
         *(number, number, array, array, array, array, ctypes.c_int),
-        *(number, real, real, real, array, array, array, array),
+        *(number, real, real, array, array, array, array),
     ]
     library.posematch_resect.restype = None
     library.posematch_place.argtypes = [

@@ -26,9 +26,8 @@ struct Camera {
 class Problem {
    public:
     Problem(int64_t n, const double* points, const double* targets, const double* weights,
-            double robust_scale, Nearest nearest)
-        : n_(n), points_(points), targets_(targets), base_(weights), robust_scale_(robust_scale),
-          nearest_(nearest), weights_(n) {}
+            Nearest nearest)
+        : n_(n), points_(points), targets_(targets), weights_(weights), nearest_(nearest) {}
 
     // Place the exemplar by a camera: joints (J, 3) in its frame, and residuals (J, 2). Returns
     // whether the root is as far away as it has to be.
@@ -44,15 +43,6 @@ class Problem {
             residuals[2 * j + 1] = q[1] / q[2] - targets_[2 * j + 1];
         }
         return t[2] >= nearest_.depth(forward);
-    }
-
-    // The weights of the next step: Cauchy's where a robust scale is given.
-    void weigh(const double* residuals) {
-        for (int64_t j = 0; j < n_; ++j) {
-            const double x = residuals[2 * j], y = residuals[2 * j + 1];
-            const double square = (x * x + y * y) / (robust_scale_ * robust_scale_);
-            weights_[j] = base_[j] / (1.0 + (robust_scale_ > 0.0 ? square : 0.0));
-        }
     }
 
     double cost(const double* residuals) const {
@@ -122,10 +112,8 @@ class Problem {
     }
 
     const int64_t n_;
-    const double *points_, *targets_, *base_;
-    const double robust_scale_;
+    const double *points_, *targets_, *weights_;
     const Nearest nearest_;
-    std::vector<double> weights_;
 };
 
 // exp([ω]×) R and t + τ. Rodrigues' formula by the half angle: exact also where it vanishes.
@@ -159,9 +147,9 @@ Camera moved(const Camera& camera, const double* delta) {
 // `targets` (B, J, 2) and `weights` (B, J), or one of each for all.
 extern "C" void posematch_resect(int64_t batch, int64_t n_joints, const double* points,
                                  const double* start, const double* targets, const double* weights,
-                                 int shared, int64_t iterations, double robust_scale,
-                                 double nearest_to_extent, double least_extent, double* rotation,
-                                 double* translation, double* placed, double* residuals) {
+                                 int shared, int64_t iterations, double nearest_to_extent,
+                                 double least_extent, double* rotation, double* translation,
+                                 double* placed, double* residuals) {
     const Nearest nearest = {nearest_to_extent, least_extent};
     std::vector<posematch::Translation> first;
     std::vector<double> new_placed(3 * n_joints), new_residuals(2 * n_joints);
@@ -171,7 +159,7 @@ extern "C" void posematch_resect(int64_t batch, int64_t n_joints, const double* 
         double *now = placed + 3 * b * n_joints, *off = residuals + 2 * b * n_joints;
         if (b == 0 || !shared)
             first.assign(1, {n_joints, targets + 2 * at, weights + at, nearest});
-        Problem problem(n_joints, exemplar, targets + 2 * at, weights + at, robust_scale, nearest);
+        const Problem problem(n_joints, exemplar, targets + 2 * at, weights + at, nearest);
         Camera camera;
         std::copy_n(start + 9 * b, 9, camera.rotation);
         posematch::turn(n_joints, camera.rotation, exemplar, now);
@@ -179,8 +167,6 @@ extern "C" void posematch_resect(int64_t batch, int64_t n_joints, const double* 
         problem.place(camera, now, off);
         double damping = kInitialDamping;
         for (int64_t i = 0; i < iterations; ++i) {
-            // The weights of a step are held while the step is judged.
-            problem.weigh(off);
             double delta[6];
             bool better = problem.step(camera, now, off, damping, delta);
             if (better) {

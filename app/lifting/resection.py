@@ -46,7 +46,6 @@ def resect(
     weights: Floats,
     *,
     iterations: int = 6,
-    robust_scale: float | None = None,
 ) -> Cameras:
     """Solve eq. 5 for a batch.
 
@@ -56,8 +55,6 @@ def resect(
         targets: (..., J, 2) observed joints, normalised image coordinates; broadcasts.
         weights: (..., J) in [0, 1], 0 = missing; broadcasts.
         iterations: Levenberg-Marquardt steps; each costs one Jacobian.
-        robust_scale: None for least squares; else the residual (normalised image coordinates) at
-            which a joint's pull is halved (Cauchy weights, re-evaluated at every step).
 
     Returns:
         The cameras; a step that would raise the cost is not taken.
@@ -87,7 +84,6 @@ def resect(
         pointer(weights),
         shared,
         iterations,
-        robust_scale or 0.0,
         NEAREST_TO_EXTENT,
         LEAST_EXTENT_MM,
         pointer(rotation),

@@ -49,20 +49,6 @@ def test_a_missing_joint_has_no_say(poses: Floats) -> None:
     np.testing.assert_allclose(found.translation_mm, translations, atol=1e-3)
 
 
-def test_robust_weights_resist_a_wrong_joint(poses: Floats) -> None:
-    rotations, translations = random_cameras(len(poses))
-    targets = see(poses, rotations, translations)
-    targets[:, 4] += 0.1
-    start = nudge(rotations)
-    plain = resect(poses, start, targets, np.ones(14), iterations=10)
-    robust = resect(poses, start, targets, np.ones(14), iterations=10, robust_scale=0.005)
-    errors = [
-        np.median(np.linalg.norm(found.rotation - rotations, axis=(1, 2)))
-        for found in (plain, robust)
-    ]
-    assert errors[1] < 0.2 * errors[0]
-
-
 def test_agrees_with_opencv_on_noisy_cases(poses: Floats) -> None:
     rotations, translations = random_cameras(len(poses))
     targets = see(poses, rotations, translations) + RNG.normal(size=(len(poses), 14, 2)) * 0.005
