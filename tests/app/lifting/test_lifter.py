@@ -230,6 +230,17 @@ def test_missing_joints_are_inferred(
     assert "truncated" in person.warnings
 
 
+def test_who_lacks_joints_stands_about_where_they_would_with_them(
+    lifter: Lifter, people: People
+) -> None:
+    missing = (0, 9, 10, 12, 13)
+    apart_mm = []
+    for pixels in people.joints_px[:20]:
+        whole = lift_one(lifter, observe(pixels)).root_mm
+        apart_mm.append(np.linalg.norm(lift_one(lifter, observe(pixels, missing)).root_mm - whole))
+    assert np.mean(apart_mm) < 400.0
+
+
 def test_a_missing_joint_is_less_sure(lifter: Lifter, people: People) -> None:
     wrist = 4
     larger = []
@@ -459,6 +470,23 @@ def test_the_camera_follows_unsure_joints_less(lifter: Lifter, people: People) -
     assert off_px[0].keys() == off_px[1].keys()
     further = [off_px[1][entry] > off_px[0][entry] for entry in off_px[0]]
     assert np.mean(further) > 0.8
+
+
+def test_neighbours_stand_by_all_joints_alike_however_sure(lifter: Lifter, people: People) -> None:
+    """Confidence tells which joint is elsewhere; how far joints scatter, covariances do."""
+    for index in range(4):
+        pixels = people.joints_px[index]
+        rays = np.column_stack(
+            [(pixels - INTRINSICS.principal_point_px) / INTRINSICS.focal_length_px, np.ones(14)]
+        )
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        # Confidences of the same centre: the camera is turned onto it.
+        across = (rays @ rotation_onto_axis(rays.sum(axis=0)).T)[:, :2]
+        apart = np.linalg.svd(across.T)[2][-1]
+        unsure = 0.85 + 0.15 * apart / np.abs(apart).max()
+        person = lift_one(lifter, Observation(pixels, unsure))
+        alike = lift_one(lifter, observe(pixels))
+        np.testing.assert_allclose(person.joints_3d_mm, alike.joints_3d_mm, atol=1e-3)
 
 
 @pytest.fixture
