@@ -31,6 +31,8 @@ HEAD_BY_EARS = 1.583
 HEAD_BY_EARS_AND_NOSE = (2.107, -0.570)
 """Weights of ears and nose, relative to the shoulders' midpoint: the head's tilt is in them."""
 HEAD_BY_NOSE = 1.619
+LEAST_CONFIDENCE = 0.2
+"""Below it a joint is as good as missing: another option that is surer is used."""
 GUESS = 0.5
 """Factor on the confidence of a joint that was found by a makeshift recipe (three times the error
 of the one it stands in for)."""
@@ -58,8 +60,8 @@ class Conversion:
     def to_lsp14(self, points: Floats, confidence: Floats) -> tuple[Floats, Floats]:
         """(P, N, D) points, (P, N) confidence, 0 = missing -> (P, 14, D), (P, 14).
 
-        A joint is as sure as the least sure of those that it comes from; 0 when no option applies
-        (its coordinates are then 0).
+        A joint is as sure as the least sure of those that it comes from, by the first option that
+        is sure enough, else by the surest; 0 when none applies (its coordinates are then 0).
         """
         people, dimensions = len(points), points.shape[2]
         out = np.zeros((people, LSP14.n_joints, dimensions))
@@ -69,7 +71,7 @@ class Conversion:
                 columns = [self.skeleton.index(source) for source in option.weights]
                 weights = np.array(list(option.weights.values()))
                 least = confidence[:, columns].min(axis=1) * option.trust
-                use = (sure[:, joint] == 0) & (least > 0)
+                use = (sure[:, joint] < LEAST_CONFIDENCE) & (least > sure[:, joint])
                 out[use, joint] = np.einsum("pjd,j->pd", points[use][:, columns], weights)
                 sure[use, joint] = least[use]
         return out, sure
@@ -128,7 +130,11 @@ def _toward(shoulders: tuple[str, str], goals: Mapping[str, float]) -> Recipe:
 def _head(
     shoulders: tuple[str, str], ears: tuple[str, str], nose: str
 ) -> dict[str, tuple[Option, ...]]:
-    """Options for neck and head top; seen from the side, one ear stands for both."""
+    """Options for neck and head top; seen from the side, one ear stands for both.
+
+    The nose beside one ear alone would take the head's turn for its tilt: 0.139 torso lengths off
+    the head top where it turns aside, not 0.093 (medians of 144 of the 494).
+    """
     either: tuple[dict[str, float], ...] = (
         {ears[0]: 0.5, ears[1]: 0.5},
         {ears[0]: 1.0},
@@ -146,10 +152,7 @@ def _head(
             Option(_toward(shoulders, {}), GUESS),
         ),
         "head_top": (
-            *(
-                Option(_toward(shoulders, {**scaled(by_ears, parts), nose: by_nose}))
-                for parts in either
-            ),
+            Option(_toward(shoulders, {**scaled(by_ears, either[0]), nose: by_nose})),
             *(Option(_toward(shoulders, scaled(HEAD_BY_EARS, parts))) for parts in either),
             Option(_toward(shoulders, {nose: HEAD_BY_NOSE}), GUESS),
         ),

@@ -3,6 +3,7 @@
 A joint's rotation is the product of its rotation channels in the order listed, relative to its
 parent, and turns the offsets of its children; position channels replace the joint's own offset,
 except where all they ever say is zero: programs that add them to the offset write that.
+Each ROOT with a person's joints is a person, and becomes a clip.
 Offsets have no stated unit. CMU's two conversions are known (``joint_tables``): their unit, where
 that makes a person, the thorax and wrist bones they lost, and the T-pose that one of them puts
 before the first frame.
@@ -16,12 +17,13 @@ import codecs
 import math
 import re
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from library_store.importers.asf_amc import CMU_LICENCE, describe_cmu
-from library_store.importers.checks import checked, unit_that_fits
+from library_store.importers.checks import checked_or_error, unit_that_fits
 from library_store.importers.clip import Clip, Float, MocapError
 from library_store.importers.head import HEAD_PER_TRUNK, put_head_top
 from library_store.importers.joint_tables import (
@@ -69,13 +71,33 @@ class BvhFile:
         return next(i for i, joint in enumerate(self.joints) if plain(joint.name) == name)
 
 
-def read(path: Path, *, mapping: Path | None = None) -> Clip:
-    """The clip of a BVH file; ``mapping`` is a table for joint names that are not known."""
+def read(path: Path, *, mapping: Path | None = None) -> list[Clip | MocapError]:
+    """The clips of a BVH file, one a person, or what is wrong with that person's.
+
+    ``mapping`` is a table for joint names that are not known.
+    """
     bvh = parse(path)
+    given = read_mapping(mapping) if mapping else None
+    trees = split(bvh)
+    people = [tree for tree in trees if _is_person(tree, given)]
+    left_out = [tree.joints[0].name for tree in trees if not _is_person(tree, given)]
+    findings = [f"left out, not the joints of a person: {', '.join(left_out)}"] if left_out else []
+    if not people:  # the joints of one person may hang on several roots; else it says what it lacks
+        people, findings = [bvh], []
+    numbers = [""] if len(people) == 1 else [f"_{n}" for n in range(1, len(people) + 1)]
+    return [
+        _clip(path, path.stem + number, person, given, findings)
+        for number, person in zip(numbers, people, strict=True)
+    ]
+
+
+def _clip(
+    path: Path, name: str, bvh: BvhFile, mapping: JointMapping | None, noticed: list[str]
+) -> Clip | MocapError:
+    """The clip of one person, with what was ``noticed`` of the file among its findings."""
     if mapping is not None:
-        given = read_mapping(mapping)
-        table = JointTable(name=given.name, targets=())
-        positions, findings = _mapped(path, bvh, given), list[str]()
+        table = JointTable(name=mapping.name, targets=())
+        positions, findings = _mapped(path, bvh, mapping), list[str]()
     else:
         table = _table_for(path, bvh)
         positions, findings = _by_table(bvh, table)
@@ -94,16 +116,16 @@ def read(path: Path, *, mapping: Path | None = None) -> Clip:
     if math.isnan(rate):
         findings.append("a frame time of 0: the frame rate is not known")
     clip = Clip(
-        name=path.stem,
+        name=name,
         subject=subject,
         action=action,
         frame_rate_hz=round(rate, 3),
         positions_mm=(positions * mm_per_unit).astype(np.float32),
         frames=frames,
-        findings=(f"joint names: {table.name}", *findings),
+        findings=(f"joint names: {table.name}", *findings, *noticed),
         licence=CMU_LICENCE if subject else "",
     )
-    return checked(path, clip, up_is_known=table.is_cmu, bones_are_known=table.is_cmu)
+    return checked_or_error(path, clip, up_is_known=table.is_cmu, bones_are_known=table.is_cmu)
 
 
 def parse(path: Path) -> BvhFile:
@@ -227,13 +249,41 @@ def world_positions(bvh: BvhFile) -> Float:
     return places
 
 
+def split(bvh: BvhFile) -> list[BvhFile]:
+    """The hierarchies of a file, each as a file of its own."""
+    starts = [i for i, joint in enumerate(bvh.joints) if joint.parent < 0]
+    trees: list[BvhFile] = []
+    column = 0
+    for start, end in pairwise([*starts, len(bvh.joints)]):
+        joints = bvh.joints[start:end]
+        width = sum(len(joint.channels) for joint in joints)
+        trees.append(
+            BvhFile(
+                joints=tuple(replace(it, parent=max(it.parent - start, -1)) for it in joints),
+                motion=bvh.motion[:, column : column + width],
+                frame_time_s=bvh.frame_time_s,
+            )
+        )
+        column += width
+    return trees
+
+
+def _is_person(bvh: BvhFile, mapping: JointMapping | None) -> bool:
+    return not _missing(bvh, mapping) if mapping else _known_table(bvh) is not None
+
+
+def _missing(bvh: BvhFile, mapping: JointMapping) -> list[str]:
+    """The joints that a user's table names and a file does not have."""
+    wanted = {plain(name) for targets in mapping.targets for name in targets}
+    return sorted(wanted.difference(plain(joint.name) for joint in bvh.joints))
+
+
 def _mapped(path: Path, bvh: BvhFile, mapping: JointMapping) -> Float:
     """The joints (F, 14, 3) that a user's table names."""
+    if missing := _missing(bvh, mapping):
+        raise MocapError(path, f"has no joints {', '.join(missing)}, which {mapping.name} names")
     names = [plain(joint.name) for joint in bvh.joints]
     wanted = [[plain(name) for name in targets] for targets in mapping.targets]
-    missing = sorted({name for targets in wanted for name in targets} - set(names))
-    if missing:
-        raise MocapError(path, f"has no joints {', '.join(missing)}, which {mapping.name} names")
     joints = world_positions(bvh)
     return np.stack([joints[:, [names.index(n) for n in t]].mean(axis=1) for t in wanted], axis=1)
 
@@ -259,12 +309,16 @@ def _by_table(bvh: BvhFile, table: JointTable) -> tuple[Float, list[str]]:
     return positions, findings
 
 
-def _table_for(path: Path, bvh: BvhFile) -> JointTable:
+def _known_table(bvh: BvhFile) -> JointTable | None:
     named = [(plain(joint.name), joint) for joint in bvh.joints]
     names = frozenset(name for name, _ in named)
     # An end site of no length, as MotionBuilder writes them, ends no bone: not a head's either.
     names -= {name for name, joint in named if name.endswith(".end") and _is_zero(joint)}
-    found = find_table(names, coinciding=_coinciding(bvh))
+    return find_table(names, coinciding=_coinciding(bvh))
+
+
+def _table_for(path: Path, bvh: BvhFile) -> JointTable:
+    found = _known_table(bvh)
     if found is None:
         listed = ", ".join(joint.name for joint in bvh.joints)
         raise MocapError(

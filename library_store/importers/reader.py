@@ -37,7 +37,7 @@ def _read_file(path: Path, mapping: Path | None) -> Sequence[Clip | MocapError]:
     """
     importers: dict[str, Callable[[], Sequence[Clip | MocapError]]] = {
         ".amc": lambda: [asf_amc.read(path)],
-        ".bvh": lambda: [bvh.read(path, mapping=mapping)],
+        ".bvh": lambda: bvh.read(path, mapping=mapping),
         ".c3d": lambda: c3d.read(path, mapping=mapping),
         ".cdf": lambda: [h36m.read(path)],
         ".npz": lambda: npz.read(path),

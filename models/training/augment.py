@@ -12,6 +12,7 @@ from library_store.skeleton import LSP14
 from models.crop import warped
 from models.training.cutout import over, place, silhouette, whole
 from models.training.dataset import TORSO, Image, LabelledCrop
+from models.training.shortened import shortened
 
 MIRROR = np.array(LSP14.mirror)
 CROP_SCALE = 1.25
@@ -22,6 +23,9 @@ gets. The others teach the first look, which meets people as they are."""
 UPRIGHT_SPREAD_DEG = 15.0
 COMPANY_SHARE = 0.25
 """Of the views that get a second person, close by, before or behind the one they are about."""
+
+SHORTENED_SHARE = 0.3
+"""Of the views of people whom an edge of the photo cuts off."""
 
 
 @dataclass(frozen=True)
@@ -101,9 +105,13 @@ def random_view(
     if rng.random() < COMPANY_SHARE and whole(other):
         crop = in_company(crop, other, rng)
     center, extent = crop.extent_px
+    beyond = np.zeros(len(crop.joints_px), np.bool_)
+    cut = shortened(crop, rng) if rng.random() < SHORTENED_SHARE else None
+    if cut is not None:
+        crop, center, extent, beyond = cut.crop, cut.center_px, cut.extent_px, cut.beyond
     scale = CROP_SCALE * float(np.exp(rng.uniform(np.log(0.85), np.log(1.4))))
     offset = rng.normal(0, 0.05, 2)
-    if rng.random() < 0.12:  # cut off at a random side
+    if cut is None and rng.random() < 0.12:  # cut off at a random side
         scale *= rng.uniform(0.55, 0.9)
         offset = rng.uniform(-0.3, 0.3, 2)
     angle = _random_turn(crop, rng)
@@ -114,6 +122,7 @@ def random_view(
     )
     sample = _warp(crop, matrix, size, flip, rng)
     image, presence = sample.image, sample.presence.copy()
+    presence[beyond[MIRROR] if flip else beyond] = 0
     if rng.random() < 0.35:
         for _ in range(rng.integers(1, 3)):
             _occlude(image, sample.joints_px, presence, other.image, rng)

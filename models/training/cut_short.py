@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from library_store.skeleton import HEAD_TOP, L_HIP, LSP14, NECK, R_HIP
+from library_store.skeleton import HEAD_TOP, L_HIP, NECK, R_HIP
 from library_store.upright import MOST_LEAN, lean_rad
 from models.training.augment import expose
 from models.training.cutout import over, place, silhouette, whole
@@ -25,9 +25,8 @@ from models.training.scenes import (
     moved,
     still_inside,
 )
+from models.training.shortened import seen_box
 
-LEAST_JOINTS = 4
-"""Of whom less can be seen nobody can say whether they are to be found."""
 LEAST_TRUNKS, MOST_TRUNKS = 0.3, 1.9
 """Where photos end, in lengths of the trunk below the neck: from the chest to above the knees."""
 LEAST_SHARE, MOST_SHARE = 0.28, 0.75
@@ -42,9 +41,6 @@ OTHER_GROUND = 0.35
 """Share of the portraits that are set before another background."""
 Floats = NDArray[np.float64]
 
-_EDGES = np.array(LSP14.edges)
-_ALONG = np.linspace(0.0, 1.0, 33)[:, None, None]
-
 
 def can_be_cut(crop: LabelledCrop) -> bool:
     """Whether head, neck and trunk are labelled and the person is upright."""
@@ -57,21 +53,6 @@ def end_px(joints_px: Floats, rng: np.random.Generator) -> float:
     neck, hips = joints_px[NECK], joints_px[[R_HIP, L_HIP]].mean(0)
     trunk_px = max(float(np.linalg.norm(hips - neck)), 1.0)
     return float(neck[1]) + trunk_px * float(rng.uniform(LEAST_TRUNKS, MOST_TRUNKS))
-
-
-def seen_box(joints_px: Floats, known: NDArray[np.bool_], photo: Floats) -> Floats | None:
-    """The corner box (4,) about what ``photo`` (x0, y0, x1, y1) shows of the known bones.
-
-    ``joints_px`` (14, 2); None of whom fewer than ``LEAST_JOINTS`` joints are in it.
-    """
-    inside = ((joints_px >= photo[:2]) & (joints_px <= photo[2:])).all(1) & known
-    if inside.sum() < LEAST_JOINTS:
-        return None
-    bones = _EDGES[known[_EDGES].all(1)]
-    start, end = joints_px[bones[:, 0]], joints_px[bones[:, 1]]
-    points = np.concatenate([(start + _ALONG * (end - start)).reshape(-1, 2), joints_px[inside]])
-    shown = points[((points >= photo[:2]) & (points <= photo[2:])).all(1)]
-    return np.concatenate([shown.min(0), shown.max(0)])
 
 
 def _photo(size: tuple[int, int], rng: np.random.Generator) -> Floats:

@@ -31,7 +31,7 @@ from models.card import WEIGHTS_DIR
 from models.errors import AnnotationError
 from models.person_detector import PersonBox
 from models.pose_estimator import PoseEstimator
-from models.training.cut_short import end_px, seen_box
+from models.training.cut_short import end_px
 from models.training.dataset import Image, decode_members, read_annotations
 from models.training.lifter_samples import (
     IN_MIRROR,
@@ -41,6 +41,7 @@ from models.training.lifter_samples import (
     samples_of,
     seen_people,
 )
+from models.training.shortened import seen_box
 
 LEAST_CONFIDENCE, LEAST_JOINTS = 0.2, 6
 """Joints of less confidence count as missing, as in the service; people with fewer are left out."""

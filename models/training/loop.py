@@ -105,27 +105,57 @@ def _average_into(ema: nn.Module, model: nn.Module, decay: float) -> None:
                 a.copy_(b)
 
 
-def _start_from(path: Path, model: nn.Module) -> None:
+def _start_from(path: Path, model: nn.Module, config: dict[str, object]) -> None:
     """Load a checkpoint's averaged weights, or those of an exported ONNX file.
 
-    What begins with the model's ``ADDED`` may be new to it.
+    What begins with the model's ``ADDED`` may be new to it. See :func:`_load`.
     """
+    its_config: dict[str, object] = {}
     if path.suffix == ".onnx":
-        from models.training.export import read_weights
+        from models.training.export import config_of, read_weights
 
         weights = read_weights(path)
+        with suppress(KeyError):  # another network's
+            its_config = config_of(weights).as_dict()
     else:
-        weights = read_checkpoint(path)["ema"]
-    missing, unknown = model.load_state_dict(weights, strict=False)
-    added = getattr(model, "ADDED", None)
+        state = read_checkpoint(path)
+        weights, its_config = state["ema"], state["config"]
+    _load(path, weights, its_config, model, config)
+
+
+def _load(
+    path: Path,
+    weights: dict[str, Tensor],
+    its_config: dict[str, object],
+    model: nn.Module,
+    config: dict[str, object],
+) -> None:
+    """Load a file's weights; ``SystemExit`` where they are of a network of another ``config``."""
+    if differs := _differs(weights, model):
+        sizes = [f"{key} {value}" for key, value in its_config.items() if value != config.get(key)]
+        hint = f" (made with {', '.join(sizes)})" if sizes else ""
+        raise SystemExit(f"{path} is of another architecture: it {differs}{hint}")
+    model.load_state_dict(weights, strict=False)
+
+
+def _differs(weights: dict[str, Tensor], model: nn.Module) -> str:
+    """What weights lack, have too or have in another shape than a model's; empty if nothing."""
+    own, added = model.state_dict(), getattr(model, "ADDED", None)
     unset = [
         key
-        for key in missing
-        if not key.endswith("num_batches_tracked") and not (added and key.startswith(added))
+        for key in own
+        if key not in weights
+        and not key.endswith("num_batches_tracked")
+        and not (added and key.startswith(added))
     ]
-    if unset or unknown:
-        lacks = f"lacks {unset[:3]} ..." if unset else f"has {unknown[:3]} ... too"
-        raise SystemExit(f"{path} is of another architecture: it {lacks}")
+    if unset:
+        return f"lacks {unset[:3]} ..."
+    if unknown := [key for key in weights if key not in own]:
+        return f"has {unknown[:3]} ... too"
+    for key, value in weights.items():
+        if value.shape != own[key].shape:
+            return f"has {key} of {tuple(value.shape)}, not of {tuple(own[key].shape)}"
+    return ""
 
 
 def read_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
@@ -161,7 +191,7 @@ def fit(
     args.out.mkdir(parents=True, exist_ok=True)
     model = model.to(args.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     if args.init:
-        _start_from(args.init, model)
+        _start_from(args.init, model, config)
     ema = copy.deepcopy(model).eval()
     optimizers = optim.build(model, args.optimizer, args.lr)
     base_rates = [[g["lr"] for g in o.param_groups] for o in optimizers]
@@ -169,7 +199,7 @@ def fit(
     last = args.out / "last.pt"
     if last.exists():
         state = read_checkpoint(last, args.device)
-        model.load_state_dict(state["model"])
+        _load(last, state["model"], state["config"], model, config)
         ema.load_state_dict(state["ema"])
         for o, s in zip(optimizers, state["optimizers"], strict=True):
             o.load_state_dict(s)

@@ -40,6 +40,16 @@ UNIT_PX = 32.0
 QUARTERS = (0.64, 0.13, 0.1, 0.13)
 """Shares of the samples that are upright and turned by one, two and three quarters: photos without
 EXIF come on their side, and sport is done upside down."""
+KINDS = {
+    "scene": 0.22,
+    "close-up": 0.06,
+    "portrait": 0.26,
+    "bust": 0.12,
+    "crowd": 0.17,
+    "mosaic": 0.17,
+}
+"""Shares of what samples show: a scene; somebody in one, enlarged and cut off; somebody who fills
+the photo; somebody down to its lower edge; who overlap; who are beside each other, or nobody."""
 ROUGH_SHARE = 0.3
 """Of the samples that are worsened beyond what ``expose`` does to all of them."""
 
@@ -131,16 +141,16 @@ def main() -> None:
         return (x, *maps, torch.from_numpy(np.stack([s.trust for s in samples])))
 
     def upright(rng: np.random.Generator, size: tuple[int, int]) -> SceneSample:
-        dice = rng.random()
-        if dice < 0.22:
+        kind = rng.choice(list(KINDS), p=list(KINDS.values()))
+        if kind == "scene":
             return scene_view(train[rng.integers(len(train))], size, rng)
-        if dice < 0.28:
+        if kind == "close-up":
             return close_up(peopled[rng.integers(len(peopled))], size, rng)
-        if dice < 0.54:
+        if kind == "portrait":
             return portrait(crops[rng.integers(len(crops))], size, rng)
-        if dice < 0.66:
+        if kind == "bust":
             return bust(cuttable[rng.integers(len(cuttable))], calm, size, rng)
-        if dice < 0.83:
+        if kind == "crowd":
             return crowd(entire, calm, train, size, rng)
         return mosaic(crops, empty, size, rng)
 

@@ -128,6 +128,38 @@ def test_a_face_puts_neck_and_head_top_in_their_places(name: str) -> None:
     assert sure[0, [NECK, HEAD_TOP]] == pytest.approx([0.9, 0.8])
 
 
+@pytest.mark.parametrize("name", ["coco17", "openpose18", "mediapipe33"])
+def test_an_ear_that_is_hardly_believed_in_is_as_good_as_none(
+    name: str, rng: np.random.Generator
+) -> None:
+    conversion = CONVERSIONS[name]
+    names = [joint.lower().replace("_", "") for joint in conversion.skeleton.joint_names]
+    ear = names.index("leftear" if "leftear" in names else "lear")
+    points = rng.normal(size=(1, len(names), 2))
+    confidence = np.ones((1, len(names)))
+    confidence[0, ear] = 0.1
+    got, sure = conversion.to_lsp14(points, confidence)
+    confidence[0, ear] = 0.0
+    without, as_sure = conversion.to_lsp14(points, confidence)
+    np.testing.assert_array_equal(got, without)
+    np.testing.assert_array_equal(sure, as_sure)
+
+
+@pytest.mark.parametrize("name", ["coco17", "openpose18", "mediapipe33"])
+def test_a_nose_aside_of_the_only_ear_is_no_tilt_of_the_head(
+    name: str, rng: np.random.Generator
+) -> None:
+    conversion = CONVERSIONS[name]
+    names = [joint.lower().replace("_", "") for joint in conversion.skeleton.joint_names]
+    points = rng.normal(size=(1, len(names), 2))
+    confidence = np.ones((1, len(names)))
+    confidence[0, names.index("leftear" if "leftear" in names else "lear")] = 0.0
+    got, _ = conversion.to_lsp14(points, confidence)
+    points[0, names.index("nose")] += [30.0, 0.0]
+    aside, _ = conversion.to_lsp14(points, confidence)
+    np.testing.assert_array_equal(aside[0, HEAD_TOP], got[0, HEAD_TOP])
+
+
 def test_human36m_needs_no_face_and_returns_root_and_spine(rng: np.random.Generator) -> None:
     conversion = CONVERSIONS["h36m17"]
     pose = rng.normal(size=(14, 3))

@@ -25,6 +25,17 @@ def test_missing_joints_are_inferred(
     assert "truncated" in person.warnings
 
 
+def test_who_lacks_joints_stands_about_where_they_would_with_them(
+    lifter: Lifter, people: People
+) -> None:
+    missing = (0, 9, 10, 12, 13)
+    apart_mm = []
+    for pixels in people.joints_px[:20]:
+        whole = lift_one(lifter, observe(pixels)).root_mm
+        apart_mm.append(np.linalg.norm(lift_one(lifter, observe(pixels, missing)).root_mm - whole))
+    assert np.mean(apart_mm) < 400.0
+
+
 def test_a_missing_joint_is_less_sure(lifter: Lifter, people: People) -> None:
     wrist = 4
     larger = []

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from app.lifting.geometry import rotation_onto_axis
 from app.lifting.lifter import Lifter, LiftingSettings
 from app.lifting.posterior import STANDARD_PX_PER_MM
 from app.lifting.types import Observation
@@ -79,6 +80,23 @@ def test_the_camera_follows_unsure_joints_less(lifter: Lifter, people: People) -
     assert off_px[0].keys() == off_px[1].keys()
     further = [off_px[1][entry] > off_px[0][entry] for entry in off_px[0]]
     assert np.mean(further) > 0.8
+
+
+def test_neighbours_stand_by_all_joints_alike_however_sure(lifter: Lifter, people: People) -> None:
+    """Confidence tells which joint is elsewhere; how far joints scatter, covariances do."""
+    for index in range(4):
+        pixels = people.joints_px[index]
+        rays = np.column_stack(
+            [(pixels - INTRINSICS.principal_point_px) / INTRINSICS.focal_length_px, np.ones(14)]
+        )
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        # Confidences of the same centre: the camera is turned onto it.
+        across = (rays @ rotation_onto_axis(rays.sum(axis=0)).T)[:, :2]
+        apart = np.linalg.svd(across.T)[2][-1]
+        unsure = 0.85 + 0.15 * apart / np.abs(apart).max()
+        person = lift_one(lifter, Observation(pixels, unsure))
+        alike = lift_one(lifter, observe(pixels))
+        np.testing.assert_allclose(person.joints_3d_mm, alike.joints_3d_mm, atol=1e-3)
 
 
 def test_who_was_seen_with_doubt_is_answered_with_doubt(lifter: Lifter, people: People) -> None:

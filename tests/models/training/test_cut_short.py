@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from library_store.skeleton import HEAD_TOP, L_WRIST, NECK
-from models.training.cut_short import bust, can_be_cut, close_up, end_px, seen_box, standing
+from models.training.cut_short import bust, can_be_cut, close_up, end_px, standing
 from models.training.scenes import LabelledScene
 from tests.models.training import crops
 from tests.models.training.crops import SIZE
@@ -15,7 +15,6 @@ from tests.models.training.crops import SIZE
 Floats = NDArray[np.float64]
 
 JOINTS = crops.standing().joints_px.astype(np.float64)
-ALL = np.ones(14, np.bool_)
 
 
 def test_photos_end_between_the_chest_and_the_knees() -> None:
@@ -24,26 +23,6 @@ def test_photos_end_between_the_chest_and_the_knees() -> None:
     # Neck at 26, hips at 66, knees at 88: below the shoulders, now and then by the shins.
     assert 36 < ends.min() < 42
     assert 95 < ends.max() < 105
-
-
-def box(known: NDArray[np.bool_], *photo: float) -> Floats:
-    found = seen_box(JOINTS, known, np.array(photo))
-    assert found is not None
-    return found
-
-
-def test_a_box_reaches_as_far_as_the_photo_shows_a_limb() -> None:
-    np.testing.assert_allclose(box(ALL, 0, 0, 120, 120), [40, 10, 80, 110])
-    # Hips at 66, knees at 88: the photo's last row shows thighs.
-    np.testing.assert_allclose(box(ALL, 0, 0, 120, 77), [40, 10, 80, 77], atol=1.0)
-    np.testing.assert_allclose(box(ALL, 60, 0, 120, 120), [60, 10, 80, 110], atol=1.0)
-    without_legs = ALL.copy()
-    without_legs[8:] = False
-    np.testing.assert_allclose(box(without_legs, 0, 0, 120, 77), [40, 10, 80, 66], atol=0.1)
-
-
-def test_of_a_head_alone_there_is_no_box() -> None:
-    assert seen_box(JOINTS, ALL, np.array([0.0, 0.0, 120.0, 28.0])) is None
 
 
 def test_only_upright_people_with_head_and_trunk_are_cut() -> None:

@@ -5,15 +5,19 @@ from __future__ import annotations
 import argparse
 import json
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 torch = pytest.importorskip("torch")
+onnx = pytest.importorskip("onnx")
 
 from models.errors import ModelError  # noqa: E402
 from models.training import loop  # noqa: E402
+from models.training.network import ConvolutionalPoseMachine, CpmConfig  # noqa: E402
+from models.training.onnx_graph import pose_model  # noqa: E402
 
 
 def test_input_grows_at_its_share_of_the_run_whatever_the_evaluations(tmp_path: Path) -> None:
@@ -82,11 +86,53 @@ def test_what_is_added_to_a_network_may_be_new_to_it(tmp_path: Path) -> None:
     new = torch.nn.ModuleDict({"a": torch.nn.Linear(2, 2), "b": torch.nn.Linear(2, 2)})
     new.ADDED = "b."
     torch.save({"ema": old.state_dict(), "config": {}, "step": 1}, tmp_path / "old.pt")
-    loop._start_from(tmp_path / "old.pt", new)
+    loop._start_from(tmp_path / "old.pt", new, {})
     assert torch.equal(new["a"].weight, old["a"].weight)
     torch.save({"ema": new.state_dict(), "config": {}, "step": 1}, tmp_path / "new.pt")
     with pytest.raises(SystemExit, match=r"has .*b\.weight"):
-        loop._start_from(tmp_path / "new.pt", old)
+        loop._start_from(tmp_path / "new.pt", old, {})
     torch.save({"ema": old["a"].state_dict(), "config": {}, "step": 1}, tmp_path / "other.pt")
     with pytest.raises(SystemExit, match=r"lacks .*a\.weight"):
-        loop._start_from(tmp_path / "other.pt", new)
+        loop._start_from(tmp_path / "other.pt", new, {})
+
+
+def test_weights_of_other_sizes_are_named_with_the_sizes_they_were_made_with(
+    tmp_path: Path,
+) -> None:
+    narrow = CpmConfig(width=8, blocks=(1, 1, 1, 1), stage_width=8, n_stages=2)
+    wide = replace(narrow, width=16)
+    made = ConvolutionalPoseMachine(wide)
+    path, exported = tmp_path / "last.pt", tmp_path / "wide.onnx"
+    torch.save({"ema": made.state_dict(), "config": wide.as_dict(), "step": 1}, path)
+    onnx.save(pose_model(made.eval(), 64), str(exported))
+    shapes = r"stem\.1\.0\.weight of \(16, 48, 3, 3\), not of \(8, 48, 3, 3\)"
+    for file in (path, exported):
+        said = rf"{file.name} is of another architecture: .*{shapes} \(made with width 16\)$"
+        with pytest.raises(SystemExit, match=said):
+            loop._start_from(file, ConvolutionalPoseMachine(narrow), narrow.as_dict())
+    longer = replace(narrow, n_stages=3)
+    with pytest.raises(SystemExit, match=r"lacks .*stages\.2.*\(made with width 16, n_stages 2\)$"):
+        loop._start_from(path, ConvolutionalPoseMachine(longer), longer.as_dict())
+
+
+def test_a_run_of_other_sizes_is_not_resumed(tmp_path: Path) -> None:
+    parser = argparse.ArgumentParser()
+    loop.add_arguments(parser)
+    options = "--steps 1 --batch 4 --threads 1 --optimizer adamw --device cpu"
+    args = parser.parse_args(["--data", "x", "--out", str(tmp_path), *options.split()])
+
+    def run(width: int) -> None:
+        loop.fit(
+            torch.nn.Conv2d(3, width, 3),
+            args,
+            sizes=[(1.0, 8)],
+            make_batch=lambda _, size: (torch.ones(4, 3, size, size),),
+            loss_of=lambda model, batch: model(batch[0]).pow(2).mean(),
+            evaluate=lambda _, __: {},
+            config={"width": width},
+        )
+
+    run(4)
+    shapes = r"weight of \(4, 3, 3, 3\), not of \(5, 3, 3, 3\) \(made with width 4\)$"
+    with pytest.raises(SystemExit, match=rf"last\.pt is of another architecture: it has {shapes}"):
+        run(5)
