@@ -89,7 +89,8 @@ def shortened(crop: LabelledCrop, rng: np.random.Generator) -> Shortened | None:
     image = crop.image.copy()
     gone = slice(row, None) if further else slice(0, row)
     image[gone if axis == 1 else (slice(None), gone)] = 0
-    beyond = ~((joints >= photo[:2] - 0.5) & (joints <= photo[2:] + 0.5)).all(1)
+    outside = (joints < photo[:2] - 0.5) | (joints > photo[2:] + 0.5)
+    beyond: NDArray[np.bool_] = np.any(outside, axis=1)
     if rng.random() >= AS_SEEN:
         growth = np.exp(rng.uniform(np.log(SMALLEST_GROWTH), np.log(LARGEST_GROWTH)))
         more = (growth - 1) * (box[axis + 2] - box[axis])
