@@ -19,7 +19,6 @@ from library_store.build import ensure_default_library
 from library_store.errors import LibraryError
 from library_store.library import Library
 from library_store.library import load as load_library
-from library_store.manifest import read_manifest
 from library_store.milvus import MilvusSettings
 from models import ModelCard, ModelError, PersonDetector, PoseEstimator, PoseLifter
 from models.choice import choose
@@ -132,15 +131,13 @@ def load_engine(settings: Settings) -> Engine:
 def reload_engine(engine: Engine, settings: Settings) -> Engine | None:
     """The engine with the library as it now lies on the disk, verified and warm; blocking.
 
-    None when that is the library it has. The networks are shared with ``engine``, which stays in
-    service meanwhile. Raises ``StartupError`` when the library cannot be used.
+    None when those are the files that it has open, unwritten since. The networks are shared with
+    ``engine``, which stays in service meanwhile. Raises ``StartupError`` when the library cannot be
+    used.
     """
     directory = locate_library(settings)
-    try:
-        if read_manifest(directory) == engine.library.manifest:
-            return None
-    except LibraryError as error:
-        raise StartupError(str(error)) from error
+    if engine.library.is_in(directory):
+        return None
     library = _open_library(directory, settings)
     pipeline = _assemble(engine.detector, engine.estimator, engine.lifter, library, settings)
     try:

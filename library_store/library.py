@@ -9,6 +9,7 @@ number of the sample (:mod:`library_store.sources`).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from library_store.backends import (
 )
 from library_store.descriptor import describe
 from library_store.errors import LibraryError
-from library_store.manifest import MEND, Licence, Manifest, check_files, steadily
+from library_store.manifest import MANIFEST, MEND, Licence, Manifest, check_files, steadily, written
 from library_store.milvus import MilvusSettings
 from library_store.sources import (
     FRAMES_FILE,
@@ -65,9 +66,11 @@ class Library:
         manifest: Manifest,
         backend: Backend,
         milvus: MilvusSettings | None,
+        files: Mapping[str, tuple[int, int, int] | None],
     ) -> None:
         self.directory = directory
         self.manifest = manifest
+        self._files = files
 
         self._poses = open_table(directory / "poses.npy")
         self._cameras = open_table(directory / "cameras.npy")
@@ -217,6 +220,10 @@ class Library:
             pass
         raise KeyError(exemplar_id)
 
+    def is_in(self, directory: Path) -> bool:
+        """Whether the files there are those that were opened, and nobody has written to them."""
+        return written(directory, self._files) == self._files
+
     def close(self) -> None:
         """Let go of the memory; the library must not be used afterwards."""
         empty = np.zeros(0, dtype=np.float32)
@@ -244,9 +251,10 @@ def load(
 
     def open_it(manifest: Manifest) -> Library:
         chosen = resolve(backend, manifest)
+        files = written(directory, (MANIFEST, *needed_files(chosen)))
         try:
             check_files(directory, manifest, sums=verify, names=needed_files(chosen))
-            return Library(directory, manifest, chosen, milvus)
+            return Library(directory, manifest, chosen, milvus, files)
         except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
             raise LibraryError(
                 f"{directory} cannot be opened ({error}); " + MEND.format(directory=directory)

@@ -18,7 +18,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -153,6 +153,21 @@ def read_manifest(directory: Path) -> Manifest:
             f"{path} contradicts itself: its sha256 or its index is not that of its files; {mend}"
         )
     return manifest
+
+
+def written(directory: Path, names: Iterable[str]) -> dict[str, tuple[int, int, int] | None]:
+    """What changes when one of these files is replaced or written to; None where it is missing.
+
+    Its inode, its size and when it was last written to, in ns.
+    """
+    states: dict[str, tuple[int, int, int] | None] = {}
+    for name in names:
+        try:
+            stat = (directory / name).stat()
+            states[name] = stat.st_ino, stat.st_size, stat.st_mtime_ns
+        except OSError:
+            states[name] = None
+    return states
 
 
 def steadily(directory: Path, work: Callable[[Manifest], T]) -> T:

@@ -40,7 +40,9 @@ router = APIRouter(tags=["poses"], dependencies=[Depends(authorise), Depends(eac
 class PoseParameters(schemas.Given):
     """What to do with a photo."""
 
-    max_people: int = Field(5, ge=1, le=MAX_PEOPLE, description="Most people to answer.")
+    max_people: int = Field(
+        5, ge=1, le=MAX_PEOPLE, description="Most people to answer: the surest, most certain first."
+    )
     candidates: schemas.Candidates = Field(
         3,
         description="How many of the shortlist (30; 10 with `method=paper`) to return at most; "

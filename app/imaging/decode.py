@@ -81,7 +81,8 @@ def decode_photo(
 
     A JPEG is decoded at 1/2, 1/4 or 1/8 as long as its longer side keeps ``side_px`` pixels, or,
     when the client says where the person is, as long as that box keeps :data:`BOX_SIDE_PX`.
-    Transparent pixels are shown on white, as viewers do; of an animation the first frame is taken.
+    Transparent pixels are shown on white, as viewers do; of an animation the first frame is taken,
+    of an animated PNG the picture for viewers that know no animations: as a rule that is the same.
 
     Raises ``UnsupportedImageTypeError``, ``TooManyPixelsError`` (before decoding) or
     ``UndecodableImageError``.
@@ -167,6 +168,8 @@ def _decode(data: bytes, header: ImageHeader, reduction: int) -> npt.NDArray[np.
     expected = (-(-header.height_px // reduction), -(-header.width_px // reduction))
     if pixels.shape[:2] != expected:
         raise UndecodableImageError(f"the {header.media_type}'s header states another size")
+    if header.clear_grey is not None:
+        pixels[pixels == header.clear_grey] = 255 if pixels.dtype == np.uint8 else 65535
     return _opaque_bgr(pixels)
 
 

@@ -24,9 +24,12 @@ _MAX_PIECES = 65_536
 _MAX_SCANS = 64
 """Of a JPEG. Encoders make about ten; each is a walk over all pixels, for as little as 20 bytes."""
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-_PNG_NEEDED = frozenset({b"tRNS", b"acTL", b"fcTL", b"fdAT"})
+_PNG_NEEDED = frozenset({b"tRNS"})
 """Of the ancillary chunks: pixels do not depend on the others, of which libpng inflates each text,
-to 8 MB at most, and complains of each that it does not like."""
+to 8 MB at most, and complains of each that it does not like. Of an animation OpenCV would hold
+more frames than the one that it gives."""
+_PNG_GREY_STEPS = {1: 255, 2: 85, 4: 17}
+"""By bits of a sample: what fewer than 8 are multiplied by to be 8."""
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 """By colour type."""
 _PNG_UNCHECKED = 1_000_000
@@ -86,6 +89,7 @@ class ImageHeader:
 
     ``width_px`` and ``height_px`` are those stored, before any EXIF orientation; ``exif`` is the
     TIFF block of the EXIF data; ``has_alpha`` says that some pixels may be transparent.
+    ``clear_grey`` are the transparent ones of a grey PNG, as decoded: OpenCV sees no difference.
     ``needless`` are the bytes, from and to, that a decoder would only lose time on; ``deflated``
     pixels are to be checked before they are decoded.
     """
@@ -95,6 +99,7 @@ class ImageHeader:
     height_px: int
     exif: bytes | None
     has_alpha: bool
+    clear_grey: int | None = None
     needless: tuple[tuple[int, int], ...] = ()
     deflated: Deflated | None = None
 
@@ -197,7 +202,8 @@ def _read_png(data: bytes) -> ImageHeader:
     size: tuple[int, int] | None = None
     exif: bytes | None = None
     has_alpha = False
-    row_bits = 0
+    clear_grey: int | None = None
+    depth = colour = row_bits = 0
     pixels: list[tuple[int, int]] = []
     needless: list[tuple[int, int]] = []
     position = len(_PNG_MAGIC)
@@ -214,12 +220,16 @@ def _read_png(data: bytes) -> ImageHeader:
             if name != b"IHDR" or length != 13:
                 _corrupt(kind, "it does not start with its header")
             size = int.from_bytes(body[:4], "big"), int.from_bytes(body[4:8], "big")
-            has_alpha = body[9] in {4, 6}
-            row_bits = size[0] * body[8] * _PNG_CHANNELS.get(body[9], 0)
+            depth, colour = body[8], body[9]
+            has_alpha = colour in {4, 6}
+            row_bits = size[0] * depth * _PNG_CHANNELS.get(colour, 0)
         elif name == b"IHDR":
             _corrupt(kind, "it has two headers")
-        elif name == b"tRNS":
+        elif name == b"tRNS" and not pixels:
             has_alpha = True
+            if colour == 0 and length == 2 and clear_grey is None:
+                sample = int.from_bytes(body, "big") & ((1 << depth) - 1)
+                clear_grey = sample * _PNG_GREY_STEPS.get(depth, 1)
         elif name == b"eXIf":
             exif = bytes(body)
         elif name == b"IDAT":
@@ -237,7 +247,9 @@ def _read_png(data: bytes) -> ImageHeader:
     most = size[1] * (row_bits // 8 + 16) + _PNG_PIECE
     is_much = sum(end - start for start, end in pixels) > _PNG_UNCHECKED
     deflated = Deflated(kind, tuple(pixels), most) if is_much else None
-    return ImageHeader(kind, size[0], size[1], exif, has_alpha, tuple(needless), deflated)
+    return ImageHeader(
+        kind, size[0], size[1], exif, has_alpha, clear_grey, tuple(needless), deflated
+    )
 
 
 def _read_webp(data: bytes) -> ImageHeader:

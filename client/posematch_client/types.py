@@ -334,7 +334,7 @@ class SourcePart(TypedDict):
 class PoseParameters(TypedDict):
     """What to do with a photo."""
 
-    # Most people to answer.
+    # Most people to answer: the surest, most certain first.
     max_people: NotRequired[int]
     # How many of the shortlist (30; 10 with `method=paper`) to return at most; never changes the
     # answer.

@@ -12,7 +12,7 @@ import pytest
 from app.schemas import BatchAnswer, PosesAnswer
 from library_store.skeleton import L_HIP, LSP14, R_HIP
 from tests.app.conftest import RENDERS, Render
-from tests.app.imaging.test_decode import STORED, encode, png_with_exif, tiff
+from tests.app.imaging.test_decode import STORED, decode, encode, png_with_exif, tiff
 from tests.app.server import Server
 
 TIMINGS = re.compile(rb'"timings_ms":\{[^}]*\}')
@@ -44,6 +44,24 @@ def project(points: Any, camera: dict[str, Any]) -> np.ndarray[Any, np.dtype[np.
 def boxed(server: Server, render: Render, query: str = "") -> dict[str, Any]:
     """The answer for the render's one person, found or not by the detector."""
     return post(server, render.data, f"box_px={render.box_px()}&{query}")
+
+
+def test_the_surest_people_are_answered_most_certain_first(
+    server: Server, renders: list[Render]
+) -> None:
+    """Fewer are the first of more."""
+    shown = [decode(render.data).pixels_bgr for render in renders[:3]]
+    small = [cv2.resize(pixels, None, fx=0.5, fy=0.5) for pixels in shown[1:]]
+    photo = encode(np.hstack([shown[0], np.vstack(small)]), ".png")
+    boxes = {}
+    for wanted in (1, 2, 10):
+        people = post(server, photo, f"max_people={wanted}")["people"]
+        scores = [person["score"] for person in people]
+        assert scores == sorted(scores, reverse=True)
+        boxes[wanted] = [person["box_px"] for person in people]
+    assert len(boxes[10]) == 3
+    assert boxes[1] == boxes[10][:1]
+    assert boxes[2] == boxes[10][:2]
 
 
 def test_the_contract(server: Server, renders: list[Render]) -> None:

@@ -143,5 +143,34 @@ def test_a_bad_library_leaves_the_old_one_in_service(
 
     pristine.rename(tmp_path / "own")
     server.process.send_signal(signal.SIGHUP)
-    wait_until("the library is the one in service", server.log)
+    wait_until("library reloaded", server.log)
     assert read_manifest(tmp_path / "own").sha256 == served(server) == old
+
+
+@pytest.mark.parametrize("replaced", [True, False])
+def test_files_that_were_written_to_are_read_again(
+    server: Server, tmp_path: Path, photo: bytes, replaced: bool
+) -> None:
+    """Though the manifest is the same: damage is named, and what mends it taken into service."""
+    own = tmp_path / "own"
+    server.process.send_signal(signal.SIGHUP)
+    wait_until("the library is the one in service", server.log)
+    assert server.metric('posematch_library_reloads_total{outcome="unchanged"}') == 1
+
+    pristine = shutil.copytree(own, tmp_path / "pristine")
+    damaged = own / "poses.npy"
+    if replaced:
+        damaged = Path(shutil.copy(damaged, tmp_path))
+    with damaged.open("r+b") as file:
+        file.seek(5_000)
+        file.write(b"oops")
+    damaged.replace(own / "poses.npy")
+    server.process.send_signal(signal.SIGHUP)
+    assert "poses.npy is corrupt" in wait_until("reload refused", server.log)
+
+    put_in_place(pristine, own)
+    server.process.send_signal(signal.SIGHUP)
+    wait_until("library reloaded", server.log)
+    assert server.client.post("/v1/poses", content=photo).status_code == 200
+    wait_until("old library let go", server.log)
+    assert deleted_maps(server) == []

@@ -174,6 +174,84 @@ def test_sixteen_bits_grey_and_alpha() -> None:
     assert (decode(deep_cut_out).pixels_bgr[:, :80] == 255).all()
 
 
+def made_png(size: tuple[int, int], depth: int, colour: int, row: bytes, *chunks: bytes) -> bytes:
+    """A PNG of equal rows; ``size`` is width and height, ``chunks`` come before the pixels."""
+    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", *size, depth, colour, 0, 0, 0))
+    pixels = png_chunk(b"IDAT", zlib.compress(size[1] * (b"\0" + row)))
+    return b"\x89PNG\r\n\x1a\n" + header + b"".join(chunks) + pixels + png_chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize(
+    ("depth", "row", "clear", "shown"),
+    [
+        (1, b"\x50", 0, [255, 255, 255, 255]),
+        (1, b"\x50", 1, [0, 255, 0, 255]),
+        (2, b"\x1b", 1, [0, 255, 170, 255]),
+        (4, b"\x05\xaf", 5, [0, 255, 170, 255]),
+        (8, b"\x00\x32\x64\xc8", 0x32, [0, 255, 100, 200]),
+        (8, b"\x00\x32\x64\xc8", 0x0132, [0, 255, 100, 200]),  # only the sample's own bits count
+        # That the next sample has the same upper byte makes no difference.
+        (16, b"\x00\x00\x80\x80\x80\x81\xff\xff", 0x8080, [0, 255, 128, 255]),
+        (8, b"\x00\x32\x64\xc8", None, [0, 50, 100, 200]),
+    ],
+)
+def test_the_transparent_grey_of_a_grey_png_is_white(
+    depth: int, row: bytes, clear: int | None, shown: list[int]
+) -> None:
+    chunks = [] if clear is None else [png_chunk(b"tRNS", clear.to_bytes(2, "big"))]
+    pixels = decode(made_png((4, 3), depth, 0, row, *chunks)).pixels_bgr
+    assert pixels.shape == (3, 4, 3)
+    assert np.array_equal(pixels, np.tile(np.array(shown, np.uint8)[:, None], (3, 1, 3)))
+
+
+def test_what_is_no_statement_of_a_transparent_grey_changes_nothing() -> None:
+    """Too short, too late or said again: libpng does not go by such either."""
+    plain = made_png((4, 3), 8, 0, b"\x00\x32\x64\xc8")
+    zero, fifty = (png_chunk(b"tRNS", bytes([0, value])) for value in (0, 0x32))
+    for data in (
+        plain[:33] + png_chunk(b"tRNS", b"\0") + plain[33:],
+        plain[:-12] + zero + plain[-12:],
+    ):
+        assert np.array_equal(decode(data).pixels_bgr, decode(plain).pixels_bgr)
+    twice = decode(plain[:33] + zero + fifty + plain[33:]).pixels_bgr
+    assert twice[0, :, 0].tolist() == [255, 50, 100, 200]
+
+
+@pytest.mark.parametrize("depth", [0, 3, 32, 255])
+def test_a_grey_png_of_an_unheard_of_depth_is_refused(depth: int) -> None:
+    with pytest.raises(UndecodableImageError):
+        decode(made_png((4, 3), depth, 0, bytes(128), png_chunk(b"tRNS", b"\0\0")))
+
+
+@pytest.mark.parametrize(
+    ("colour", "row", "chunks"),
+    [
+        (2, bytes([0, 0, 0, 10, 20, 30]), [(b"tRNS", bytes(6))]),
+        (3, b"\0\1", [(b"PLTE", bytes([9, 9, 9, 10, 20, 30])), (b"tRNS", b"\0")]),
+    ],
+)
+def test_transparent_colours_of_other_pngs_are_white(
+    colour: int, row: bytes, chunks: list[tuple[bytes, bytes]]
+) -> None:
+    made = made_png((2, 1), 8, colour, row, *(png_chunk(*chunk) for chunk in chunks))
+    assert decode(made).pixels_bgr.tolist() == [[[255, 255, 255], [30, 20, 10]]]
+
+
+def test_of_an_animated_png_the_still_picture_is_taken() -> None:
+    """Also where it is none of the frames, or these are not as announced."""
+    red, blue = b"\xc8\0\0", b"\0\0\xc8"
+    still = made_png((1, 1), 8, 2, red)
+    frames = [
+        png_chunk(b"fcTL", struct.pack(">IIIIIHHBB", 2 * i, 1, 1, 0, 0, 1, 10, 0, 0))
+        + png_chunk(b"fdAT", struct.pack(">I", 2 * i + 1) + zlib.compress(b"\0" + blue))
+        for i in range(2)
+    ]
+    for announced in (0, 1, 2, 9):
+        starts = png_chunk(b"acTL", struct.pack(">II", announced, 0))
+        data = still[:33] + starts + still[33:-12] + b"".join(frames) + still[-12:]
+        assert decode(data).pixels_bgr.tolist() == [[[0, 0, 200]]]
+
+
 def test_the_first_frame_of_an_animation() -> None:
     frames = [scene(), 255 - scene()]
     animation = cv2.Animation()
