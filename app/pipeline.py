@@ -30,7 +30,7 @@ from library_store.errors import IndexUnavailableError
 from models.heatmaps import Joints2D
 from models.person_detector import PersonBox
 from models.presence import present
-from models.truncation import beyond_edge, stated_confidence
+from models.truncation import beyond_edge
 
 Floats = npt.NDArray[np.float64]
 
@@ -218,18 +218,17 @@ class Pipeline:
         )
         clock.lap("decode")
         boxes, joints = self._find(seen, query, clock)
-        beyond = [
-            beyond_edge(found.positions_px, photo.width_px, photo.height_px) for found in joints
-        ]
         observations = [
             Observation(
                 joints_px=found.positions_px,
                 confidence=found.belief,
                 covariance_px2=found.covariance_px2,
                 depths_px=found.depths_px,
-                truncated=bool(outside.any()),
+                truncated=bool(
+                    beyond_edge(found.positions_px, photo.width_px, photo.height_px).any()
+                ),
             )
-            for found, outside in zip(joints, beyond, strict=True)
+            for found in joints
         ]
         lifted = self._lift(observations, intrinsics, query, clock)
         people = tuple(
@@ -238,11 +237,11 @@ class Pipeline:
                 score=None if query.box_px else box.score,
                 joints_px=found.positions_px,
                 present=np.ones(len(found.positions_px), bool),
-                confidence=stated_confidence(found, outside),
+                confidence=found.confidence,
                 sigma_px=found.sigma_px,
                 lifted=person,
             )
-            for box, found, outside, person in zip(boxes, joints, beyond, lifted, strict=True)
+            for box, found, person in zip(boxes, joints, lifted, strict=True)
         )
         if query.mirrored:
             people = tuple(_mirror(person, photo.width_px) for person in people)

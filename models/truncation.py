@@ -1,9 +1,9 @@
 """People whom the photo's edge cuts off: a box of what is seen, and how large the person would be.
 
-The pose network knows people who fill its crop. Of a portrait the box holds head, shoulders and
-arms, twice as large as the network ever saw them: it finds half of them. The less it believes, the
-more of the person is missing, and the more the box must grow beyond the edge. What it then says of
-joints out there is guessed, and stated with less confidence.
+Of a portrait the box holds head, shoulders and arms, twice as large as those of whole people. The
+pose network has learned from such crops (``models/training/shortened.py``), and still reads them
+better at the scale that it knows best. The less it believes, the more of the person is missing, and
+the more the box must grow beyond the edge. Where joints out there may be is then guessed as well.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from models.heatmaps import Floats, Joints2D
+from models.heatmaps import Floats
 from models.person_detector import PersonBox
 
 NEAR_EDGE = 0.25
@@ -24,27 +24,12 @@ PLAINLY = 1.2
 """How many times as much must be believed of the whole person: of who ends near the edge, but is
 not cut off, the larger view is believed in a little more now and then, and read worse."""
 
-BEYOND_EDGE = 0.55
-"""How often a joint that is placed beyond the photo's edge is right, of what is believed of it: at
-every belief about half as often as one within (docs/experiments.md)."""
-
 
 def beyond_edge(positions_px: Floats, width_px: int, height_px: int) -> NDArray[np.bool_]:
     """Which joints (J, 2) px lie outside a photo of that size, (J,)."""
     size = np.array([width_px, height_px])
     outside: NDArray[np.bool_] = np.any((positions_px < -0.5) | (positions_px > size - 0.5), axis=1)
     return outside
-
-
-def stated_confidence(joints: Joints2D, beyond: NDArray[np.bool_]) -> Floats | None:
-    """How probably each joint (J,) is right, those ``beyond`` the edge told from the others.
-
-    None without calibration. Lifting goes by ``belief``: of where an unseen leg may be, half a
-    chance is worth something.
-    """
-    if joints.confidence is None:
-        return None
-    return joints.confidence * np.where(beyond, BEYOND_EDGE, 1.0)
 
 
 def whole(box: PersonBox, width_px: int, height_px: int, belief: float) -> PersonBox | None:
