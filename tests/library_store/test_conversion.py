@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from library_store.conversion import CONVERSIONS, GUESS, NECK_TO_EARS
+from library_store.conversion import CONVERSIONS, GUESS, NECK_TO_EARS, Conversion
 from library_store.skeleton import HEAD_TOP, LSP14, NECK
 
 NAMES = sorted(CONVERSIONS)
@@ -128,15 +128,25 @@ def test_a_face_puts_neck_and_head_top_in_their_places(name: str) -> None:
     assert sure[0, [NECK, HEAD_TOP]] == pytest.approx([0.9, 0.8])
 
 
+def face(name: str) -> tuple[Conversion, int, int]:
+    """A skeleton's conversion, and the numbers of its left ear and nose."""
+    conversion = CONVERSIONS[name]
+    names = [joint.lower().replace("_", "") for joint in conversion.skeleton.joint_names]
+    return conversion, names.index("leftear" if "leftear" in names else "lear"), names.index("nose")
+
+
+def seen(conversion: Conversion, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """One person's joints anywhere, all of them sure."""
+    joints = conversion.skeleton.n_joints
+    return rng.normal(size=(1, joints, 2)), np.ones((1, joints))
+
+
 @pytest.mark.parametrize("name", ["coco17", "openpose18", "mediapipe33"])
 def test_an_ear_that_is_hardly_believed_in_is_as_good_as_none(
     name: str, rng: np.random.Generator
 ) -> None:
-    conversion = CONVERSIONS[name]
-    names = [joint.lower().replace("_", "") for joint in conversion.skeleton.joint_names]
-    ear = names.index("leftear" if "leftear" in names else "lear")
-    points = rng.normal(size=(1, len(names), 2))
-    confidence = np.ones((1, len(names)))
+    conversion, ear, _ = face(name)
+    points, confidence = seen(conversion, rng)
     confidence[0, ear] = 0.1
     got, sure = conversion.to_lsp14(points, confidence)
     confidence[0, ear] = 0.0
@@ -149,13 +159,11 @@ def test_an_ear_that_is_hardly_believed_in_is_as_good_as_none(
 def test_a_nose_aside_of_the_only_ear_is_no_tilt_of_the_head(
     name: str, rng: np.random.Generator
 ) -> None:
-    conversion = CONVERSIONS[name]
-    names = [joint.lower().replace("_", "") for joint in conversion.skeleton.joint_names]
-    points = rng.normal(size=(1, len(names), 2))
-    confidence = np.ones((1, len(names)))
-    confidence[0, names.index("leftear" if "leftear" in names else "lear")] = 0.0
+    conversion, ear, nose = face(name)
+    points, confidence = seen(conversion, rng)
+    confidence[0, ear] = 0.0
     got, _ = conversion.to_lsp14(points, confidence)
-    points[0, names.index("nose")] += [30.0, 0.0]
+    points[0, nose] += [30.0, 0.0]
     aside, _ = conversion.to_lsp14(points, confidence)
     np.testing.assert_array_equal(aside[0, HEAD_TOP], got[0, HEAD_TOP])
 
