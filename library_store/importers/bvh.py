@@ -78,9 +78,13 @@ def read(path: Path, *, mapping: Path | None = None) -> list[Clip | MocapError]:
     """
     bvh = parse(path)
     given = read_mapping(mapping) if mapping else None
-    trees = split(bvh)
-    people = [tree for tree in trees if _is_person(tree, given)]
-    left_out = [tree.joints[0].name for tree in trees if not _is_person(tree, given)]
+    people: list[BvhFile] = []
+    left_out: list[str] = []
+    for tree in split(bvh):
+        if _is_person(tree, given):
+            people.append(tree)
+        else:
+            left_out.append(tree.joints[0].name)
     findings = [f"left out, not the joints of a person: {', '.join(left_out)}"] if left_out else []
     if not people:  # the joints of one person may hang on several roots; else it says what it lacks
         people, findings = [bvh], []
