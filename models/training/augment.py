@@ -23,7 +23,6 @@ gets. The others teach the first look, which meets people as they are."""
 UPRIGHT_SPREAD_DEG = 15.0
 COMPANY_SHARE = 0.25
 """Of the views that get a second person, close by, before or behind the one they are about."""
-
 SHORTENED_SHARE = 0.3
 """Of the views of people whom an edge of the photo cuts off."""
 
