@@ -105,7 +105,7 @@ def random_view(
         crop = in_company(crop, other, rng)
     center, extent = crop.extent_px
     beyond = np.zeros(len(crop.joints_px), np.bool_)
-    cut = shortened(crop, rng) if rng.random() < SHORTENED_SHARE else None
+    cut = shortened(crop, other.image, rng) if rng.random() < SHORTENED_SHARE else None
     if cut is not None:
         crop, center, extent, beyond = cut.crop, cut.center_px, cut.extent_px, cut.beyond
     scale = CROP_SCALE * float(np.exp(rng.uniform(np.log(0.85), np.log(1.4))))

@@ -2,19 +2,21 @@
 
 The crop that the service makes of them holds what the photo shows, at a larger scale than that of
 whole people, and black beyond the edge; or, where little is believed in that, the whole person's
-place, most of it black (``models/truncation.py``). The network meets both here.
+place, most of it black (``models/truncation.py``). The network meets both here. What ends a person
+may also be a table or a wall: then there is something else than black.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from library_store.skeleton import LSP14
 from library_store.upright import MOST_LEAN, lean_rad
-from models.training.dataset import LabelledCrop
+from models.training.dataset import Image, LabelledCrop
 
 LEAST_JOINTS = 4
 """Of whom less can be seen nobody can say whether they are to be found."""
@@ -27,6 +29,8 @@ AS_SEEN = 0.6
 """Of the views, those at the scale of what is seen."""
 SMALLEST_GROWTH, LARGEST_GROWTH = 1.3, 2.4
 """How much longer than that the others are."""
+FURNISHED = 0.35
+"""Of the views, those where something else stands before what is gone."""
 GUESSED = 0.3
 """Trust in places beyond the edge, of that in the label."""
 Floats = NDArray[np.float64]
@@ -39,7 +43,7 @@ _ALONG = np.linspace(0.0, 1.0, 33)[:, None, None]
 class Shortened:
     """A person whose picture ends too early.
 
-    ``crop`` is black beyond the edge; ``center_px`` (2,) and ``extent_px`` are of what a view is to
+    ``crop`` is black, or another picture, beyond the edge; ``center_px`` (2,) and ``extent_px`` are of what a view is to
     show, ``beyond`` (14,) says which joints cannot be seen for the edge.
     """
 
@@ -64,8 +68,21 @@ def seen_box(joints_px: Floats, known: NDArray[np.bool_], photo: Floats) -> Floa
     return np.concatenate([shown.min(0), shown.max(0)])
 
 
-def shortened(crop: LabelledCrop, rng: np.random.Generator) -> Shortened | None:
-    """``crop`` cut off by a random edge; None of whom too little is known to be cut."""
+def piece_of(picture: Image, size: tuple[int, int], rng: np.random.Generator) -> Image:
+    """A random part of a picture, at its own proportions, as width x height pixels."""
+    height, width = picture.shape[:2]
+    scale = min(width / size[0], height / size[1], float(rng.uniform(0.5, 2.0)))
+    w, h = (max(1, int(scale * side)) for side in size)
+    x, y = int(rng.integers(width - w + 1)), int(rng.integers(height - h + 1))
+    piece: Image = cv2.resize(picture[y : y + h, x : x + w], size, interpolation=cv2.INTER_LINEAR)
+    return piece
+
+
+def shortened(crop: LabelledCrop, other: Image, rng: np.random.Generator) -> Shortened | None:
+    """``crop`` cut off by a random edge; None of whom too little is known to be cut.
+
+    ``other`` (h, w, 3) uint8 lends what may stand before the rest.
+    """
     known = crop.weight > 0
     height, width = crop.image.shape[:2]
     joints = crop.joints_px.astype(np.float64)
@@ -88,7 +105,8 @@ def shortened(crop: LabelledCrop, rng: np.random.Generator) -> Shortened | None:
         return None
     image = crop.image.copy()
     gone = slice(row, None) if further else slice(0, row)
-    image[gone if axis == 1 else (slice(None), gone)] = 0
+    rest = image[gone if axis == 1 else (slice(None), gone)]  # a view
+    rest[:] = piece_of(other, rest.shape[1::-1], rng) if rng.random() < FURNISHED else 0
     outside = (joints < photo[:2] - 0.5) | (joints > photo[2:] + 0.5)
     beyond: NDArray[np.bool_] = np.any(outside, axis=1)
     if rng.random() >= AS_SEEN:

@@ -11,11 +11,13 @@ from models.training import augment
 from models.training.augment import random_view
 from models.training.shortened import (
     FEWEST,
+    FURNISHED,
     GUESSED,
     LARGEST_GROWTH,
     LEAST_JOINTS,
     MOST,
     Shortened,
+    piece_of,
     seen_box,
     shortened,
 )
@@ -26,6 +28,7 @@ Floats = NDArray[np.float64]
 PERSON = crops.standing()
 JOINTS = PERSON.joints_px.astype(np.float64)
 ALL = np.ones(14, np.bool_)
+BLACK = np.zeros((40, 60, 3), np.uint8)
 
 
 def box(known: NDArray[np.bool_], *photo: float) -> Floats:
@@ -51,7 +54,7 @@ def test_of_a_head_alone_there_is_no_box() -> None:
 @pytest.fixture(scope="module")
 def cuts() -> list[Shortened]:
     """Three hundred; two joints of this person are level now and then, and too few are left."""
-    tries = [shortened(PERSON, np.random.default_rng(seed)) for seed in range(320)]
+    tries = [shortened(PERSON, BLACK, np.random.default_rng(seed)) for seed in range(320)]
     found = [one for one in tries if one is not None]
     assert len(found) > 280
     return found
@@ -70,6 +73,29 @@ def test_what_lies_beyond_the_edge_is_black_and_hardly_trusted(cuts: list[Shorte
         np.testing.assert_array_equal(one.crop.visible, np.where(one.beyond, 0, PERSON.visible))
         np.testing.assert_array_equal(one.crop.joints_px, PERSON.joints_px)
     assert PERSON.image.max() > 0, "the person's own picture stays as it is"
+
+
+def test_something_else_than_black_may_end_a_person() -> None:
+    table = np.full((40, 60, 3), (20, 90, 200), np.uint8)
+    x, y = np.rint(PERSON.joints_px).astype(int).T
+    furnished = tries = 0
+    for seed in range(320):
+        one = shortened(PERSON, table, np.random.default_rng(seed))
+        if one is None:
+            continue
+        gone = one.crop.image[y, x][one.beyond]
+        behind = bool((gone == table[0, 0]).all())
+        assert behind or not gone.any()
+        tries, furnished = tries + 1, furnished + behind
+    assert 0.7 * FURNISHED < furnished / tries < 1.3 * FURNISHED
+
+
+@pytest.mark.parametrize("size", [(160, 10), (1, 160), (7, 3)])
+def test_pieces_of_pictures_of_any_size_fill_it(size: tuple[int, int]) -> None:
+    for picture in (BLACK + 9, np.full((1, 1, 3), 9, np.uint8)):
+        piece = piece_of(picture, size, np.random.default_rng(0))
+        assert piece.shape == (size[1], size[0], 3)
+        assert (piece == 9).all()
 
 
 def test_who_stands_loses_feet_most_often_and_any_joint_now_and_then(
@@ -103,7 +129,7 @@ def test_views_are_of_what_is_seen_or_of_the_whole_person_beyond_the_edge(
 def test_of_whom_too_little_is_known_nothing_is_cut_off() -> None:
     weight = PERSON.weight.copy()
     weight[FEWEST:] = 0
-    assert shortened(replace(PERSON, weight=weight), np.random.default_rng(0)) is None
+    assert shortened(replace(PERSON, weight=weight), BLACK, np.random.default_rng(0)) is None
 
 
 def test_in_a_view_joints_beyond_the_edge_are_absent(monkeypatch: pytest.MonkeyPatch) -> None:
