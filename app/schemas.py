@@ -10,6 +10,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     ValidationInfo,
@@ -39,7 +40,15 @@ CoordinatePx = Annotated[
 ]
 FocalLengthPx = Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False)]
 SubjectHeightMm = Annotated[float, Field(ge=300, le=3000, allow_inf_nan=False)]
-Candidates = Annotated[int, Field(ge=0, le=MAX_CANDIDATES)]
+
+
+def _whole(value: object) -> object:
+    """JSON's 640.0 is the integer 640; what is no whole number stays as it is."""
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+Candidates = Annotated[int, Field(ge=0, le=MAX_CANDIDATES), BeforeValidator(_whole)]
+SidePx = Annotated[int, Field(ge=1, le=1_000_000), BeforeValidator(_whole)]
 
 
 class Answer(BaseModel):
@@ -282,8 +291,8 @@ class GivenPerson(Given):
 class ImageSize(Given):
     """Size of the upright photo the joints are from."""
 
-    width_px: int = Field(ge=1, le=1_000_000)
-    height_px: int = Field(ge=1, le=1_000_000)
+    width_px: SidePx
+    height_px: SidePx
 
 
 class LiftRequest(Given):

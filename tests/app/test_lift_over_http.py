@@ -196,6 +196,26 @@ def test_no_json(server: Server, body: bytes) -> None:
     problem(server.client.post("/v1/lift", content=body), 400, "malformed-body")
 
 
+def test_no_json_is_placed_for_the_client_and_not_quoted_in_the_log(server: Server) -> None:
+    response = server.client.post("/v1/lift", content=b'{"image": of-somebody}')
+    body = problem(response, 400, "malformed-body")
+    assert body["detail"] == "the body is not JSON: expected value at line 1 column 11"
+    assert "of-somebody" not in server.log.read_text()
+
+
+def test_a_whole_number_may_have_a_point(server: Server, renders: list[Render]) -> None:
+    """In JSON Schema 640.0 is an integer, and some languages write it so."""
+    body = request_of(renders[0])
+    size = body["image"]
+    pointed = {"image": {name: float(value) for name, value in size.items()}, "candidates": 3.0}
+    answers = [server.client.post("/v1/lift", json=body | change) for change in ({}, pointed)]
+    assert [answer.status_code for answer in answers] == [200, 200]
+    assert len({json.dumps(answer.json()["people"]) for answer in answers}) == 1
+    for value in (640.5, "640", True):
+        response = server.client.post("/v1/lift", json=body | {"image": size | {"width_px": value}})
+        assert problem(response, 422, "invalid-input")["errors"][0]["where"] == "image.width_px"
+
+
 def test_zero_has_one_text(server: Server, renders: list[Render]) -> None:
     body = request_of(renders[0])
     body["people"][0]["joints_2d"][0]["x_px"] = -0.0
