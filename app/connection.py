@@ -31,6 +31,7 @@ import os
 import re
 from collections.abc import Callable
 from contextlib import suppress
+from email.utils import formatdate
 from http import HTTPStatus
 from typing import Any, ClassVar, cast
 
@@ -333,6 +334,7 @@ def _encode_problem(status: HTTPStatus, slug: str, detail: str, request_id: str)
     body = json.dumps(problem).encode()
     head = (
         f"HTTP/1.1 {status.value} {status.phrase}\r\n"
+        f"date: {formatdate(usegmt=True)}\r\n"  # which 4xx must have (RFC 9110, 6.6.1)
         "content-type: application/problem+json\r\n"
         f"content-length: {len(body)}\r\n"
         f"x-request-id: {request_id}\r\n"

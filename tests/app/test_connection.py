@@ -6,6 +6,7 @@ import json
 import socket
 import time
 from contextlib import suppress
+from email.utils import parsedate_to_datetime
 
 import pytest
 
@@ -113,6 +114,7 @@ def test_requests_before_what_is_no_http_are_answered(
             assert (status, headers["x-request-id"]) == (422, str(number))
         status, headers, body = read_whole(stream)
         assert (status, json.loads(body)["request_id"]) == (400, headers["x-request-id"])
+        assert abs(parsedate_to_datetime(headers["date"]).timestamp() - time.time()) < 60
         assert stream.read() == b""
 
 
