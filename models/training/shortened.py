@@ -43,8 +43,8 @@ _ALONG = np.linspace(0.0, 1.0, 33)[:, None, None]
 class Shortened:
     """A person whose picture ends too early.
 
-    ``crop`` is black, or another picture, beyond the edge; ``center_px`` (2,) and ``extent_px`` are of what a view is to
-    show, ``beyond`` (14,) says which joints cannot be seen for the edge.
+    ``crop`` is black, or another picture, beyond the edge; ``center_px`` (2,) and ``extent_px`` are
+    of what a view is to show, ``beyond`` (14,) says which joints cannot be seen for the edge.
     """
 
     crop: LabelledCrop
