@@ -108,7 +108,7 @@ def _average_into(ema: nn.Module, model: nn.Module, decay: float) -> None:
 def _start_from(path: Path, model: nn.Module, config: dict[str, object]) -> None:
     """Load a checkpoint's averaged weights, or those of an exported ONNX file.
 
-    What begins with the model's ``ADDED`` may be new to it. See :func:`_load`.
+    What begins with the model's ``ADDED`` may be missing in them. See :func:`_load`.
     """
     its_config: dict[str, object] = {}
     if path.suffix == ".onnx":
@@ -120,7 +120,32 @@ def _start_from(path: Path, model: nn.Module, config: dict[str, object]) -> None
     else:
         state = read_checkpoint(path)
         weights, its_config = state["ema"], state["config"]
-    _load(path, weights, its_config, model, config)
+    _load(path, weights, its_config, model, config, getattr(model, "ADDED", None))
+
+
+def _resume(
+    path: Path,
+    model: nn.Module,
+    ema: nn.Module,
+    optimizers: list[torch.optim.Optimizer],
+    args: argparse.Namespace,
+    config: dict[str, object],
+) -> tuple[int, float]:
+    """Load a run's state: the steps done and the seconds they took.
+
+    ``SystemExit`` where the run was started with another network or optimizer.
+    """
+    state = read_checkpoint(path, args.device)
+    _load(path, state["model"], state["config"], model, config)
+    ema.load_state_dict(state["ema"])
+    if len(state["optimizers"]) != len(optimizers):
+        raise SystemExit(
+            f"{path} is of a run that was started with another optimizer than {args.optimizer}: "
+            "resume it with that (--optimizer), or start anew in another --out"
+        )
+    for o, s in zip(optimizers, state["optimizers"], strict=True):
+        o.load_state_dict(s)
+    return state["step"], state["spent_s"]
 
 
 def _load(
@@ -129,18 +154,22 @@ def _load(
     its_config: dict[str, object],
     model: nn.Module,
     config: dict[str, object],
+    added: str | None = None,
 ) -> None:
-    """Load a file's weights; ``SystemExit`` where they are of a network of another ``config``."""
-    if differs := _differs(weights, model):
+    """Load a file's weights, which may lack what begins with ``added``.
+
+    ``SystemExit`` where they are of a network of another ``config``.
+    """
+    if differs := _differs(weights, model, added):
         sizes = [f"{key} {value}" for key, value in its_config.items() if value != config.get(key)]
         hint = f" (made with {', '.join(sizes)})" if sizes else ""
         raise SystemExit(f"{path} is of another architecture: it {differs}{hint}")
     model.load_state_dict(weights, strict=False)
 
 
-def _differs(weights: dict[str, Tensor], model: nn.Module) -> str:
+def _differs(weights: dict[str, Tensor], model: nn.Module, added: str | None) -> str:
     """What weights lack, have too or have in another shape than a model's; empty if nothing."""
-    own, added = model.state_dict(), getattr(model, "ADDED", None)
+    own = model.state_dict()
     unset = [
         key
         for key in own
@@ -198,12 +227,7 @@ def fit(
     step, spent_s = 0, 0.0
     last = args.out / "last.pt"
     if last.exists():
-        state = read_checkpoint(last, args.device)
-        _load(last, state["model"], state["config"], model, config)
-        ema.load_state_dict(state["ema"])
-        for o, s in zip(optimizers, state["optimizers"], strict=True):
-            o.load_state_dict(s)
-        step, spent_s = state["step"], state["spent_s"]
+        step, spent_s = _resume(last, model, ema, optimizers, args, config)
         print(f"resumed at step {step}", flush=True)
     started = time.monotonic() - spent_s
 

@@ -115,24 +115,36 @@ def test_weights_of_other_sizes_are_named_with_the_sizes_they_were_made_with(
         loop._start_from(path, ConvolutionalPoseMachine(longer), longer.as_dict())
 
 
-def test_a_run_of_other_sizes_is_not_resumed(tmp_path: Path) -> None:
+def test_a_run_is_resumed_as_it_was_started_or_not_at_all(tmp_path: Path) -> None:
     parser = argparse.ArgumentParser()
     loop.add_arguments(parser)
-    options = "--steps 1 --batch 4 --threads 1 --optimizer adamw --device cpu"
-    args = parser.parse_args(["--data", "x", "--out", str(tmp_path), *options.split()])
 
-    def run(width: int) -> None:
+    def run(steps: int, width: int = 4, optimizer: str = "adamw", added: bool = False) -> None:
+        options = f"--steps {steps} --batch 4 --threads 1 --optimizer {optimizer} --device cpu"
+        args = parser.parse_args(["--data", "x", "--out", str(tmp_path), *options.split()])
+        model = torch.nn.ModuleDict({"seen": torch.nn.Conv2d(3, width, 3)})
+        model.ADDED = "depth."
+        if added:
+            model["depth"] = torch.nn.Conv2d(3, 1, 3)
         loop.fit(
-            torch.nn.Conv2d(3, width, 3),
+            model,
             args,
             sizes=[(1.0, 8)],
             make_batch=lambda _, size: (torch.ones(4, 3, size, size),),
-            loss_of=lambda model, batch: model(batch[0]).pow(2).mean(),
+            loss_of=lambda model, batch: model["seen"](batch[0]).pow(2).mean(),
             evaluate=lambda _, __: {},
             config={"width": width},
         )
 
-    run(4)
-    shapes = r"weight of \(4, 3, 3, 3\), not of \(5, 3, 3, 3\) \(made with width 4\)$"
+    run(1)
+    shapes = r"seen\.weight of \(4, 3, 3, 3\), not of \(5, 3, 3, 3\) \(made with width 4\)$"
     with pytest.raises(SystemExit, match=rf"last\.pt is of another architecture: it has {shapes}"):
-        run(5)
+        run(2, width=5)
+    # A new run may start from such weights (--init), the averages of an old one do not have them.
+    with pytest.raises(SystemExit, match=r"last\.pt is of another architecture: it lacks .*depth"):
+        run(2, added=True)
+    with pytest.raises(SystemExit, match=r"last\.pt .* another optimizer than muon: .*--optimizer"):
+        run(2, optimizer="muon")
+    assert loop.read_checkpoint(tmp_path / "last.pt")["step"] == 1
+    run(2)
+    assert loop.read_checkpoint(tmp_path / "last.pt")["step"] == 2
