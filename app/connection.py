@@ -18,14 +18,13 @@ those that can be given from the request's head alone (``app.api.shedding``) are
 without a task and a walk through the application. And no answer is sent with Python's lock held
 (``_Sender``): who is woken by it may take the processor, and all workers would wait.
 
-The errors of the table arise before there is a request, so they are written here, as problem+json
-like all others and with a request id of their own, which the log has too.
+The errors of the table arise before there is a request, so they are sent from here, with a request
+id of their own, which the log has too.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
 import logging
 import os
 import re
@@ -39,7 +38,14 @@ from starlette.types import Scope
 from uvicorn._types import ASGI3Application
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
 
-from app.errors import PROBLEM_TYPE_PREFIX
+from app.errors import (
+    PROBLEM_MEDIA_TYPE,
+    HeadTooLargeError,
+    MalformedHttpError,
+    RequestError,
+    UploadTooSlowError,
+    encode_problem,
+)
 from app.observability import new_request_id
 
 logger = logging.getLogger("posematch.connection")
@@ -71,7 +77,7 @@ class Connection(HttpToolsProtocol):
         self._head_bytes = 0
         self._dropped_bytes = 0
         self._in_body = False
-        self._last_word: tuple[int, str, str] | None = None
+        self._last_word: RequestError | None = None
         self._expect("head", self.transport.close)
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -100,7 +106,7 @@ class Connection(HttpToolsProtocol):
         if head is not None and head is self._timers.get("head"):  # what began here counts anew
             self._head_bytes += len(data)
             if self._head_bytes > MAX_HEAD_BYTES:
-                self._end(431, "head-too-large", f"the head is larger than {MAX_HEAD_BYTES} bytes")
+                self._end(HeadTooLargeError(MAX_HEAD_BYTES))
 
     def on_message_begin(self) -> None:
         """A head begins; the parser calls this."""
@@ -108,7 +114,7 @@ class Connection(HttpToolsProtocol):
         self._unset_keepalive_if_required()
         self._head_bytes = 0
         why = f"the head of the request was not complete after {self.patience_s:g} s"
-        self._expect("head", lambda: self._end(408, "upload-too-slow", why))
+        self._expect("head", lambda: self._end(UploadTooSlowError(why)))
 
     def on_headers_complete(self) -> None:
         """The head is complete; the parser calls this."""
@@ -138,7 +144,7 @@ class Connection(HttpToolsProtocol):
             self._expect("rest", self._give_up)
         word, self._last_word = self._last_word, None
         if word is not None:
-            self._end(*word)
+            self._end(word)
 
     def shutdown(self) -> None:
         """The service ends, and waits for answers only."""
@@ -158,7 +164,7 @@ class Connection(HttpToolsProtocol):
 
     def send_400_response(self, msg: str) -> None:
         """What is no HTTP is answered as a problem, too."""
-        self._end(400, "malformed-http", msg)
+        self._end(MalformedHttpError(msg))
 
     def _expect(self, name: str, otherwise: Callable[[], None]) -> None:
         self._arrived(name)
@@ -169,7 +175,7 @@ class Connection(HttpToolsProtocol):
         if timer is not None:
             timer.cancel()
 
-    def _end(self, status: int, slug: str, detail: str) -> None:
+    def _end(self, error: RequestError) -> None:
         """Answer with a problem and close, once the requests before are answered."""
         if self.transport.is_closing():
             self.transport.close()
@@ -179,15 +185,16 @@ class Connection(HttpToolsProtocol):
         if self.pipeline and self.pipeline[0][0] is own:
             self.pipeline.popleft()  # this is its answer
         if running is not None and running is not own and not running.response_complete:
-            self._last_word = status, slug, detail
+            self._last_word = error
             return
         if own is None or not own.response_started:
             request_id = new_request_id()
             client = self.client[0] if self.client else None
             logger.info(
-                detail, extra={"request_id": request_id, "status": status, "client": client}
+                error.detail,
+                extra={"request_id": request_id, "status": error.status, "client": client},
             )
-            self.transport.write(_encode_problem(HTTPStatus(status), slug, detail, request_id))
+            self.transport.write(_encoded(error, request_id))
         self._disconnect()
         self.transport.close()
 
@@ -323,19 +330,13 @@ def connection_class(patience_s: float, early_answer: EarlyAnswer) -> type[Conne
     return type("Connection", (Connection,), members)
 
 
-def _encode_problem(status: HTTPStatus, slug: str, detail: str, request_id: str) -> bytes:
-    problem = {
-        "type": PROBLEM_TYPE_PREFIX + slug,
-        "title": status.phrase,
-        "status": status.value,
-        "detail": detail,
-        "request_id": request_id,
-    }
-    body = json.dumps(problem).encode()
+def _encoded(error: RequestError, request_id: str) -> bytes:
+    """The whole response; the connection is closed behind it."""
+    body = encode_problem(error.problem(request_id))
     head = (
-        f"HTTP/1.1 {status.value} {status.phrase}\r\n"
+        f"HTTP/1.1 {error.status} {HTTPStatus(error.status).phrase}\r\n"
         f"date: {formatdate(usegmt=True)}\r\n"  # which 4xx must have (RFC 9110, 6.6.1)
-        "content-type: application/problem+json\r\n"
+        f"content-type: {PROBLEM_MEDIA_TYPE}\r\n"
         f"content-length: {len(body)}\r\n"
         f"x-request-id: {request_id}\r\n"
         "server-timing: app;dur=0\r\n"

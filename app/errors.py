@@ -7,6 +7,7 @@
     └── RequestError                 one request cannot be answered; becomes problem+json
         ├── EmptyBodyError               400
         ├── MalformedBodyError           400
+        ├── MalformedHttpError           400
         ├── PreflightRefusedError        400
         ├── UnauthorizedError            401
         ├── ExemplarNotFoundError        404
@@ -17,6 +18,7 @@
         ├── UndecodableImageError        422
         ├── InvalidInputError            422
         ├── QuotaExceededError           429
+        ├── HeadTooLargeError            431
         ├── OverloadedError              503
         ├── LibraryUnavailableError      503
         └── NotReadyError                503
@@ -27,9 +29,11 @@ exception's cause (``raise ... from``) and never into the answer.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
+PROBLEM_MEDIA_TYPE = "application/problem+json"
 PROBLEM_TYPE_PREFIX = "urn:posematch:problem:"
 
 
@@ -73,6 +77,22 @@ class RequestError(PoseMatchError):
         """The problem's ``type``, stable across versions."""
         return PROBLEM_TYPE_PREFIX + self.slug
 
+    def problem(self, request_id: str) -> dict[str, object]:
+        """The problem details (RFC 9457) of this error in the request of that id."""
+        return {
+            "type": self.type_uri,
+            "title": self.title,
+            "status": self.status,
+            "detail": self.detail,
+            "request_id": request_id,
+            **self.extra,
+        }
+
+
+def encode_problem(problem: Mapping[str, object]) -> bytes:
+    """Problem details as a body of ``PROBLEM_MEDIA_TYPE``."""
+    return json.dumps(problem, ensure_ascii=False, separators=(",", ":")).encode()
+
 
 class EmptyBodyError(RequestError):
     """No bytes were sent."""
@@ -88,6 +108,15 @@ class MalformedBodyError(RequestError):
     status = 400
     slug = "malformed-body"
     title = "Malformed body"
+
+
+class MalformedHttpError(RequestError):
+    """The bytes on the connection are no HTTP."""
+
+    status = 400
+    slug = "malformed-http"
+    title = "Malformed HTTP"
+    closes_connection = True
 
 
 class PreflightRefusedError(RequestError):
@@ -119,7 +148,7 @@ class ExemplarNotFoundError(RequestError):
 
 
 class UploadTooSlowError(RequestError):
-    """The body did not arrive in time."""
+    """The head or the body did not arrive in time."""
 
     status = 408
     slug = "upload-too-slow"
@@ -209,6 +238,18 @@ class QuotaExceededError(RequestError):
             f"too many requests with this key; try again in {retry_after_s} s",
             headers={"Retry-After": str(retry_after_s)},
         )
+
+
+class HeadTooLargeError(RequestError):
+    """The request's line and headers do not end."""
+
+    status = 431
+    slug = "head-too-large"
+    title = "Head too large"
+    closes_connection = True
+
+    def __init__(self, limit_bytes: int) -> None:
+        super().__init__(f"the head is larger than {limit_bytes} bytes")
 
 
 class OverloadedError(RequestError):

@@ -18,6 +18,7 @@ from prometheus_client.process_collector import ProcessCollector
 from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from app.api.problems import problem_response
 from app.errors import NotReadyError, RequestError
 
 logger = logging.getLogger("posematch")
@@ -193,14 +194,15 @@ class RequestContextMiddleware:
         except asyncio.CancelledError:
             if status:
                 raise
-            error = NotReadyError("the service is shutting down")
-            await _send_problem(error, request_id, send_with_headers)
+            error: RequestError = NotReadyError("the service is shutting down")
+            await problem_response(error, request_id)(scope, receive, send_with_headers)
         except Exception:
             logger.exception("unhandled error", extra={"request_id": request_id})
             if status:
                 raise  # the answer has begun; only closing the connection is left
             wrong = "something went wrong here; the request id identifies it in our log"
-            await _send_problem(RequestError(wrong), request_id, send_with_headers)
+            error = RequestError(wrong)
+            await problem_response(error, request_id)(scope, receive, send_with_headers)
         finally:
             route = state.get("route") or getattr(inner.get("route"), "path", "unmatched")
             record_request(
@@ -254,26 +256,6 @@ def record_request(
 
 
 _METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
-
-
-async def _send_problem(error: RequestError, request_id: str, send: Send) -> None:
-    body = json.dumps(
-        {
-            "type": error.type_uri,
-            "title": error.title,
-            "status": error.status,
-            "detail": error.detail,
-            "request_id": request_id,
-        }
-    ).encode()
-    headers = {
-        "content-type": "application/problem+json",
-        "content-length": str(len(body)),
-        **error.headers,
-    }
-    raw = [(name.lower().encode(), value.encode()) for name, value in headers.items()]
-    await send({"type": "http.response.start", "status": error.status, "headers": raw})
-    await send({"type": "http.response.body", "body": body})
 
 
 class JsonFormatter(logging.Formatter):

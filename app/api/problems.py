@@ -9,43 +9,35 @@ from typing import Any
 
 from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ValidationError
 from starlette.exceptions import HTTPException
 
 from app.admission import ClientGoneError
 from app.errors import (
+    PROBLEM_MEDIA_TYPE,
     PROBLEM_TYPE_PREFIX,
     InvalidInputError,
     LibraryUnavailableError,
     OverloadedError,
     RequestError,
+    encode_problem,
 )
 from app.schemas import Problem
 
 logger = logging.getLogger("posematch")
 
-PROBLEM_MEDIA_TYPE = "application/problem+json"
 CLIENT_CLOSED_REQUEST = 499
 """The status logged, never sent, when the client has gone (nginx's convention)."""
 
 
 def problem_of(error: RequestError, request_id: str) -> Problem:
-    """The problem details of a refusal."""
-    return Problem(
-        type=error.type_uri,
-        title=error.title,
-        status=error.status,
-        detail=error.detail,
-        request_id=request_id,
-        **error.extra,
-    )
+    """The problem details of a refusal, as a part of an answer."""
+    return Problem.model_validate(error.problem(request_id))
 
 
 def problem_response(error: RequestError, request_id: str) -> Response:
     """The answer to a refused request."""
-    problem = problem_of(error, request_id)
-    return _response(problem.model_dump(), error.status, error.headers)
+    return _response(error.problem(request_id), error.status, error.headers)
 
 
 def invalid_input(error: ValidationError | RequestValidationError) -> InvalidInputError:
@@ -111,8 +103,8 @@ async def _on_client_gone(request: Request, _: Exception) -> Response:
     return Response(status_code=CLIENT_CLOSED_REQUEST)
 
 
-def _response(problem: dict[str, Any], status: int, headers: Mapping[str, str]) -> Response:
-    return JSONResponse(problem, status, headers=headers, media_type=PROBLEM_MEDIA_TYPE)
+def _response(problem: Mapping[str, object], status: int, headers: Mapping[str, str]) -> Response:
+    return Response(encode_problem(problem), status, headers, PROBLEM_MEDIA_TYPE)
 
 
 def describe_ok(model: type[BaseModel], text: str) -> dict[int | str, dict[str, Any]]:

@@ -12,7 +12,7 @@ import pytest
 
 from app.api.bodies import UploadMemory
 from app.connection import MAX_HEAD_BYTES
-from app.errors import OverloadedError
+from app.errors import OverloadedError, RequestError
 from tests.app.server import Server, read_response, read_whole
 
 PATIENCE_S = 1.5
@@ -39,6 +39,9 @@ def check_problem(connection: socket.socket, status: int, slug: str) -> None:
     assert answered == status
     problem = json.loads(body)
     assert problem["type"] == f"urn:posematch:problem:{slug}"
+    # A type has one title, whoever says it (RFC 9457, 3.1.3).
+    (title,) = {kind.title for kind in RequestError.__subclasses__() if kind.slug == slug}
+    assert problem["title"] == title
     assert problem["status"] == status
     assert problem["request_id"]
     assert is_closed(connection)
