@@ -129,12 +129,9 @@ class PersonDetector:
         *,
         weights_dir: Path = WEIGHTS_DIR,
         provider: ProviderChoice = "auto",
-        threads: int = 1,
         concurrency: int = 1,
     ) -> None:
-        self._model = OnnxModel(
-            weights_dir, name, provider=provider, threads=threads, concurrency=concurrency
-        )
+        self._model = OnnxModel(weights_dir, name, provider=provider, concurrency=concurrency)
         output = self._model.card.output
         if not isinstance(output, DetectorOutput):
             raise ModelError(f"model {name} is no person detector: its card says {output.kind}")

@@ -108,20 +108,18 @@ def runtime_of(
     return Runtime(provider, card.precision)
 
 
-def open_session(
-    weights: bytes, runtime: Runtime, *, threads: int, concurrency: int
-) -> ort.InferenceSession:
+def open_session(weights: bytes, runtime: Runtime, *, concurrency: int) -> ort.InferenceSession:
     """A session that runs wholly on ``runtime.provider``, or an exception of onnxruntime's."""
     options = ort.SessionOptions()
     # Requests run side by side, each on one core; spinning would steal from the others.
-    options.intra_op_num_threads = threads
+    options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 3
     name = EXECUTION_PROVIDERS[runtime.provider]
     arguments: dict[str, Any] = {}
     if runtime.provider == "openvino":
-        arguments = _openvino(runtime, threads, concurrency)
+        arguments = _openvino(runtime, concurrency)
     elif runtime.provider == "cuda":
         # The default tries every algorithm anew for every number of people.
         arguments = {"cudnn_conv_algo_search": "HEURISTIC"}
@@ -136,13 +134,13 @@ def open_session(
     return session
 
 
-def _openvino(runtime: Runtime, threads: int, concurrency: int) -> dict[str, str]:
+def _openvino(runtime: Runtime, concurrency: int) -> dict[str, str]:
     config = {
         "PERFORMANCE_HINT": "LATENCY",
         "INFERENCE_PRECISION_HINT": "f32" if runtime.precision == "fp32" else "bf16",
-        # As many requests side by side, as many threads each.
+        # As many requests side by side, a thread each.
         "NUM_STREAMS": str(concurrency),
-        "INFERENCE_NUM_THREADS": str(threads * concurrency),
+        "INFERENCE_NUM_THREADS": str(concurrency),
         "ENABLE_CPU_PINNING": "NO",
     }
     return {"device_type": "CPU", "load_config": json.dumps({"CPU": config})}

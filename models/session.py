@@ -49,8 +49,8 @@ class OnnxModel:
     """A weights file and its card, ready to run. Safe to call from several threads.
 
     ``provider`` auto tries those present, the fastest first, and says so in the log when one of
-    them fails; any other is used or refused. ``threads`` is how many one run may use,
-    ``concurrency`` how many runs are made side by side.
+    them fails; any other is used or refused. A run uses one thread; ``concurrency`` is how many
+    are made side by side.
     """
 
     def __init__(
@@ -59,7 +59,6 @@ class OnnxModel:
         name: str,
         *,
         provider: ProviderChoice = "auto",
-        threads: int = 1,
         concurrency: int = 1,
     ) -> None:
         self.card: ModelCard = read_card(directory / f"{name}.json")
@@ -69,7 +68,7 @@ class OnnxModel:
         probe = _probe(self.card)
         for runtime in candidates:
             try:
-                session = open_session(weights, runtime, threads=threads, concurrency=concurrency)
+                session = open_session(weights, runtime, concurrency=concurrency)
                 if runtime.provider != "cpu":  # a GPU too old or too full fails when it first runs
                     session.run(None, {session.get_inputs()[0].name: probe.batch})
             except Exception as error:
