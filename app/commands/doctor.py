@@ -305,7 +305,8 @@ def _photo(settings: Settings) -> Finding:
     finally:
         engine.library.close()
     median_ms = float(np.median(times_ms))
-    said = f"{len(people)} of 1 person found, {median_ms:.0f} ms"
+    index = engine.library.index_backend
+    said = f"{len(people)} of 1 person found, matched with {index}, {median_ms:.0f} ms"
     if not people:
         return Finding(
             "a photo", "failure", said, "the model finds nobody in the sample: use other weights"

@@ -41,7 +41,7 @@ def test_all_is_well(library_dir: Path) -> None:
     findings = examine(0, library_dir=library_dir, deadline_ms=60_000)
     assert {it["state"] for it in findings.values()} <= {"ok", "warning"}
     assert findings["a photo"]["state"] == "ok"
-    assert "1 of 1 person found" in findings["a photo"]["said"]
+    assert "1 of 1 person found, matched with hnsw, " in findings["a photo"]["said"]
     said = run("doctor", library_dir=library_dir, port=free_port(), deadline_ms=60_000).stdout
     assert re.search(r"ok  library: small \S+, 4000 exemplars", said)
 
