@@ -21,7 +21,7 @@ from PIL import Image
 
 from benchmarks import fuzz
 from benchmarks.service import Service, started_service
-from tests.app.imaging.test_decode import encode, png_chunk
+from tests.app.imaging.image_files import encode, png_chunk
 from tests.app.server import Server
 
 PNG = b"\x89PNG\r\n\x1a\n"

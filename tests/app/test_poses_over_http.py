@@ -12,7 +12,7 @@ import pytest
 from app.schemas import BatchAnswer, PosesAnswer
 from library_store.skeleton import L_HIP, LSP14, R_HIP
 from tests.app.conftest import RENDERS, Render
-from tests.app.imaging.test_decode import STORED, decode, encode, png_with_exif, tiff
+from tests.app.imaging.image_files import STORED, decode, encode, png_with_exif, tiff
 from tests.app.server import Server
 
 TIMINGS = re.compile(rb'"timings_ms":\{[^}]*\}')

@@ -11,7 +11,7 @@ import numpy as np
 from playwright.sync_api import Browser, Route, expect
 
 from tests.app.conftest import RENDERS, Render
-from tests.app.imaging.test_decode import STORED, png_with_exif, tiff, webp_with_exif
+from tests.app.imaging.image_files import STORED, png_with_exif, tiff, webp_with_exif
 from tests.app.page.visit import PATIENCE_MS, Visit, answered, colour_share, picture, upload
 from tests.app.server import Server
 

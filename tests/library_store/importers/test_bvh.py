@@ -1,3 +1,5 @@
+"""BVH: the text, its numbers and rates, and CMU's conversions."""
+
 from __future__ import annotations
 
 import json
@@ -9,34 +11,23 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from library_store.anatomy import Float, root_of
-from library_store.importers import Clip, MocapError, read, read_all
+from library_store.importers import MocapError, read
 from library_store.importers.bvh import parse, world_positions
-from library_store.importers.joint_tables import CMU_MM_PER_UNIT, TABLES, plain
-from library_store.skeleton import HEAD_TOP, LSP14, NECK, R_WRIST
+from library_store.importers.joint_tables import CMU_MM_PER_UNIT, TABLES
+from library_store.skeleton import LSP14
+from tests.library_store.importers.bvh_files import (
+    CHAIN,
+    JAW,
+    LIMBS,
+    centred,
+    renamed,
+    scaled,
+    write,
+)
 from tests.library_store.importers.files import ASF, amc, cmu_bvh, walk
 
 TOLERANCE_MM = 0.05
 """Of the made-up person, whose thorax is as long as the upper back. Real clips: 7 mm."""
-
-
-def write(path: Path, text: str) -> Path:
-    path.write_text(text)
-    return path
-
-
-def centred(clip: Clip) -> Float:
-    positions = clip.positions_mm.astype(np.float64)
-    return positions - root_of(positions)[:, None]
-
-
-def scaled(text: str, factor: float) -> str:
-    """A BVH file with all its offsets times ``factor``; how the root moves is left."""
-    return re.sub(
-        r"OFFSET (\S+) (\S+) ([^\s}]+)",
-        lambda found: "OFFSET " + " ".join(f"{float(v) * factor:.9f}" for v in found.groups()),
-        text,
-    )
 
 
 @pytest.mark.parametrize("max_names", [False, True])
@@ -90,30 +81,6 @@ def test_a_rate_that_contradicts_the_index_is_reported(tmp_path: Path) -> None:
     (clip,) = read(write(tmp_path / "61_02.bvh", cmu_bvh(walk())))
     assert clip.frame_rate_hz == 60.0
     assert any("the file says 120 Hz" in finding for finding in clip.findings)
-
-
-CHAIN = """\
-HIERARCHY
-ROOT a
-{
-  OFFSET 0 0 0
-  CHANNELS 6 Xposition Yposition Zposition Yrotation Xrotation Zrotation
-  JOINT b
-  {
-    OFFSET 0 2 0
-    CHANNELS 3 Zrotation Xrotation Yrotation
-    End Site
-    {
-      OFFSET 1 0 0
-    }
-  }
-}
-MOTION
-Frames: 2
-Frame Time: 0.04
-1 2 3 0 0 0 0 0 0
-1 2 3 90 0 0 90 0 0
-"""
 
 
 def test_forward_kinematics_by_hand(tmp_path: Path) -> None:
@@ -270,200 +237,3 @@ def test_offsets_of_zero_beside_places_are_no_lost_thorax(tmp_path: Path) -> Non
         assert clip.findings[0] == "joint names: MotionBuilder"
     (again,) = read(write(tmp_path / "02_01.bvh", with_places(text, idle=True)))
     assert "thorax above" in " ".join(again.findings)
-
-
-SWORD = "ROOT Sword\n{\nOFFSET 0 0 0\nCHANNELS 3 Xposition Yposition Zposition\n}\n"
-
-
-def together(*texts: str, prop: str = "") -> str:
-    """Files of the same length as one: a ROOT each, behind a thing's that never moves."""
-    heads, motions = zip(*(text.split("MOTION\n") for text in texts), strict=True)
-    count, time, *_ = motions[0].splitlines()
-    rows = zip(*(motion.splitlines()[2:] for motion in motions), strict=True)
-    still = "0 0 0 " if prop else ""
-    lines = [still + " ".join(row) for row in rows]
-    people = "".join(head.removeprefix("HIERARCHY\n") for head in heads)
-    return "\n".join([f"HIERARCHY\n{prop}{people}MOTION", count, time, *lines]) + "\n"
-
-
-@pytest.mark.parametrize("prop", ["", SWORD])
-def test_every_root_with_a_persons_joints_is_a_person(tmp_path: Path, prop: str) -> None:
-    other = {name: values[::-1] for name, values in walk().items()}
-    texts = [cmu_bvh(walk(), max_names=True), cmu_bvh(other, max_names=True)]
-    alone = [read(write(tmp_path / f"{n}.bvh", text))[0] for n, text in enumerate(texts)]
-    clips = read(write(tmp_path / "duel.bvh", together(*texts, prop=prop)))
-    assert [clip.name for clip in clips] == ["duel_1", "duel_2"]
-    for clip, truth in zip(clips, alone, strict=True):
-        assert_allclose(clip.positions_mm, truth.positions_mm, atol=0.01)
-        said = ("left out, not the joints of a person: Sword",) if prop else ()
-        assert clip.findings == truth.findings + said
-    (one,) = read(write(tmp_path / "solo.bvh", together(texts[0], prop=SWORD)))
-    assert one.name == "solo"
-    assert "left out, not the joints of a person: Sword" in one.findings
-
-
-def test_a_person_beyond_use_is_an_error_beside_the_other(tmp_path: Path) -> None:
-    giant = scaled(cmu_bvh(walk()), 3.0)
-    path = write(tmp_path / "a.bvh", together(cmu_bvh(walk()), giant))
-    clips, errors = read_all([path])
-    assert [clip.name for clip in clips] == ["a_1"]
-    (error,) = errors
-    assert re.search(r"a\.bvh: clip 'a_2': .*no person's", str(error))
-
-
-def test_a_mapping_file_names_the_joints_of_everybody(tmp_path: Path) -> None:
-    text = re.sub(r"(ROOT|JOINT) (\w+)", r"\1 my\2", cmu_bvh(walk()))
-    own = dict(zip(LSP14.joint_names, TABLES[0].targets, strict=True))
-    names = {joint: f"my{name}" for joint, name in own.items()}
-    mapping = write(tmp_path / "mapping.json", json.dumps(names))
-    both = write(tmp_path / "both.bvh", together(text, text, prop=SWORD))
-    assert [clip.name for clip in read(both, mapping=mapping)] == ["both_1", "both_2"]
-    with pytest.raises(MocapError, match=r"joint names not known: Sword, myHips"):
-        read(both)
-    write(mapping, json.dumps(names | {"neck": "myNose"}))
-    with pytest.raises(MocapError, match=r"has no joints mynose"):
-        read(both, mapping=mapping)
-
-
-def test_the_joints_of_one_person_on_two_roots(tmp_path: Path) -> None:
-    """What no hierarchy has alone is taken from all of them."""
-    arm = renamed("{side}{limb}", LIMBS, ("Right", "Left"))
-    names = dict(zip(LSP14.joint_names, TABLES[0].targets, strict=True)) | {"neck": "neck9"}
-    mapping = write(tmp_path / "mapping.json", json.dumps(names | {"r_wrist": "Glove"}))
-    path = write(tmp_path / "a.bvh", together(arm, prop=SWORD.replace("Sword", "Glove")))
-    (clip,) = read(path, mapping=mapping)
-    assert_allclose(clip.positions_mm[:, R_WRIST], 0.0)  # where the glove lies
-
-
-def test_unknown_names_are_listed_and_a_mapping_file_helps(tmp_path: Path) -> None:
-    text = re.sub(r"(ROOT|JOINT) (\w+)", r"\1 my\2", cmu_bvh(walk()))
-    path = write(tmp_path / "dance.bvh", text)
-    with pytest.raises(MocapError, match=r"myRightForeArm.*mapping file.*l_ankle"):
-        read(path)
-    own = dict(zip(LSP14.joint_names, TABLES[0].targets, strict=True))
-    mapping = tmp_path / "mapping.json"
-    mapping.write_text(json.dumps({joint: f"my{name}" for joint, name in own.items()}))
-    (clip,) = read(path, mapping=mapping)
-    # Not known to be CMU's: the unit is found, the missing bones are only reported.
-    assert any("CMU's units" in finding for finding in clip.findings)
-    assert any("wrist bone missing" in finding for finding in clip.findings)
-
-
-def test_a_mapping_file_in_toml_with_means(tmp_path: Path) -> None:
-    text = re.sub(r"(ROOT|JOINT) (\w+)", r"\1 my\2", cmu_bvh(walk()))
-    path = write(tmp_path / "dance.bvh", text)
-    own = dict(zip(LSP14.joint_names, TABLES[0].targets, strict=True))
-    one = "".join(f'{joint} = "my{name}"\n' for joint, name in own.items())
-    (clip,) = read(path, mapping=write(tmp_path / "one.toml", one))
-    lines = one.replace('neck = "myneck1"', 'neck = ["myNeck1", "mySpine1"]')
-    assert lines != one
-    (mean,) = read(path, mapping=write(tmp_path / "mean.toml", lines))
-    neck = LSP14.index("neck")
-    others = [joint for joint in range(14) if joint != neck]
-    assert_allclose(mean.positions_mm[:, others], clip.positions_mm[:, others], atol=0.01)
-    lower = clip.positions_mm[:, neck, 1] - mean.positions_mm[:, neck, 1]
-    assert np.all((lower > 20.0) & (lower < 120.0)), "half of the way from Spine1 to Neck1"
-    with pytest.raises(MocapError, match="has no joints mynose"):
-        read(path, mapping=write(tmp_path / "bad.toml", one.replace("myneck1", "mynose")))
-
-
-@pytest.mark.parametrize(
-    ("content", "problem"),
-    [
-        ('{"neck": 3}', "joints missing"),
-        ("{", "JSON"),
-        ("[1]", "object"),
-        ('{"neck": "Neck"}', "joints missing: head_top"),
-        ('{"nose": "Neck"}', "unknown: nose"),
-    ],
-)
-def test_a_bad_mapping_file_is_named(tmp_path: Path, content: str, problem: str) -> None:
-    path = write(tmp_path / "a.bvh", CHAIN)
-    mapping = write(tmp_path / "mapping.json", content)
-    with pytest.raises(MocapError, match=problem) as caught:
-        read(path, mapping=mapping)
-    assert str(mapping) in str(caught.value)
-
-
-LIMBS = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
-BLENDER = ("upper_arm", "forearm", "hand", "thigh", "shin", "foot")
-ROKOKO = ("Arm", "ForeArm", "Hand", "Thigh", "Shin", "Foot")
-SMPL_X = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-BIPED = ("UpperArm", "Forearm", "Hand", "Thigh", "Calf", "Foot")
-
-
-def renamed(pattern: str, limbs: tuple[str, ...], sides: tuple[str, str]) -> str:
-    """The walk under other joint names; no thorax is lost, as far as names tell."""
-    text = cmu_bvh(walk()).replace("Spine1", "Spine2").replace("Neck1", "Neck9")
-    for side, other in zip(("Right", "Left"), sides, strict=True):
-        for limb, new in zip(LIMBS, limbs, strict=True):
-            name = pattern.format(side=other, limb=new)
-            text = re.sub(rf"(ROOT|JOINT) {side}{limb}\b", rf"\1 {name}", text)
-    return text
-
-
-@pytest.mark.parametrize(
-    ("table", "pattern", "limbs", "sides"),
-    [
-        ("MotionBuilder", "mixamorig:{side}{limb}", LIMBS, ("Right", "Left")),
-        ("MotionBuilder", "mixamorig1_{side}{limb}", LIMBS, ("Right", "Left")),
-        ("MotionBuilder", "Ann|{side}{limb}", LIMBS, ("Right", "Left")),
-        ("MotionBuilder", "Character1_{side}{limb}", LIMBS, ("Right", "Left")),
-        ("Rokoko", "{side}{limb}", ROKOKO, ("Right", "Left")),
-        ("SMPL-X", "{side}_{limb}", SMPL_X, ("right", "left")),
-        ("Blender", "{limb}.{side}", BLENDER, ("R", "L")),
-        ("Blender", "DEF-{limb}_{side}", BLENDER, ("R", "L")),
-        ("Character Studio biped", "Bip01 {side} {limb}", BIPED, ("R", "L")),
-    ],
-)
-def test_names_of_other_programs(
-    tmp_path: Path, table: str, pattern: str, limbs: tuple[str, ...], sides: tuple[str, str]
-) -> None:
-    (truth,) = read(write(tmp_path / "walk.bvh", cmu_bvh(walk())))
-    (clip,) = read(write(tmp_path / "a.bvh", renamed(pattern, limbs, sides)))
-    assert clip.findings[0] == f"joint names: {table}"
-    assert (clip.subject, clip.licence) == ("", "")
-    legs = slice(LSP14.index("r_hip"), None)
-    assert_allclose(centred(clip)[:, legs], centred(truth)[:, legs], atol=0.05)
-
-
-JAW = "JOINT Jaw\n{\nOFFSET 0 0.5 0.5\nCHANNELS 0\nEnd Site\n{\nOFFSET 0 0 1\n}\n}\n"
-
-
-@pytest.mark.parametrize(
-    "tip", [JAW, "End Site\n{\nOFFSET 0.000000 0.0 -0.0\n}\n", "End Site\n{\n}\n"]
-)
-def test_a_head_without_its_top(tmp_path: Path, tip: str) -> None:
-    """Other bones hang on it, as in some files of Mixamo, or its end site has no length."""
-    text = renamed("mixamorig:{side}{limb}", LIMBS, ("Right", "Left"))
-    head = text.index("JOINT Head")
-    end = text.index("End Site", head)
-    close = text.index("}", end) + 1
-    (clip,) = read(write(tmp_path / "a.bvh", text[:end] + tip + text[close:]))
-    assert clip.findings[0] == "joint names: MotionBuilder, no head top"
-    assert "head top at 0.47 of the trunk beyond the neck assumed" in clip.findings
-    positions = clip.positions_mm.astype(np.float64)
-    head_mm = np.linalg.norm(positions[:, HEAD_TOP] - positions[:, NECK], axis=1)
-    trunk_mm = np.linalg.norm(positions[:, NECK] - root_of(positions), axis=1)
-    assert_allclose(head_mm, 0.47 * np.median(trunk_mm), rtol=2e-3)
-
-
-def test_mixamo_with_a_head_top_in_centimetres(tmp_path: Path) -> None:
-    text = cmu_bvh(walk()).replace("Spine1", "Spine2").replace("Neck1", "Neck2")
-    text = re.sub(r"(ROOT|JOINT) (\w+)", r"\1 mixamorig:\2", text)
-    end = text.index("End Site", text.index("mixamorig:Head"))
-    close = text.index("}", end)
-    offset = text[text.index("OFFSET", end) : close].strip()
-    top = f"JOINT mixamorig:HeadTop_End {{\n{offset}\nCHANNELS 0\nEnd Site {{ OFFSET 0 0 0 }} }}"
-    text = text[:end] + top + text[close + 1 :]
-    (clip,) = read(write(tmp_path / "mixamo.bvh", text))
-    assert clip.findings[0] == "joint names: Mixamo"
-    (again,) = read(write(tmp_path / "centimetres.bvh", scaled(text, 2.54 / 0.45)))
-    assert any("centimetres" in finding for finding in again.findings)
-    assert_allclose(centred(again), centred(clip), atol=0.05)
-
-
-def test_every_table_has_fourteen_joints() -> None:
-    assert all(len(set(table.targets)) == LSP14.n_joints for table in TABLES)
-    for table in TABLES:
-        assert all(target == plain(target) for target in table.targets)

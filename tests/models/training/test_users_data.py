@@ -15,7 +15,7 @@ from library_store.skeleton import LSP14
 from models.errors import AnnotationError
 from models.training.users_coco import KEPT_PX, read_coco
 from models.training.users_h36m import read_human36m
-from tests.app.imaging.test_decode import tiff, with_exif
+from tests.app.imaging.image_files import tiff, with_exif
 from tests.models.training import user_files
 
 JOINT = {name: i for i, name in enumerate(LSP14.joint_names)}
