@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from itertools import pairwise
+import tomllib
+from itertools import chain, pairwise
 from pathlib import Path
 
 import pytest
@@ -144,6 +145,14 @@ def test_the_table_of_licences_is_that_of_the_lock_file() -> None:
     assert START in text
     assert END in text
     assert renewed(text) == text, "run scripts/licences-table"
+
+
+def test_the_licence_of_every_extra_is_stated() -> None:
+    text = (ROOT / "docs" / "licences.md").read_text()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for requirement in chain.from_iterable(project["optional-dependencies"].values()):
+        name = re.split(r"[^\w-]", requirement)[0]
+        assert re.search(rf"(?<![\w-]){re.escape(name)}(?![\w-])", text), name
 
 
 def test_the_vendored_versions_are_those_named() -> None:
