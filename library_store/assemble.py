@@ -157,6 +157,7 @@ def write_manifest(
         sha256=content_digest(files),
     )
     steps.sweep(files)
-    (workshop / MANIFEST).write_text(manifest.to_json(), encoding="utf-8")
+    # Names of files may be any bytes.
+    (workshop / MANIFEST).write_text(manifest.to_json(), encoding="utf-8", errors="replace")
     report("checksums", 1.0)
     return manifest

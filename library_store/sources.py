@@ -170,7 +170,8 @@ class Sources:
 def write_sources(path: Path, groups: Sequence[SourceGroup], clips: Sequence[SourceClip]) -> None:
     """Write ``sources.json``."""
     content = {"groups": [asdict(it) for it in groups], "clips": [asdict(it) for it in clips]}
-    path.write_text(json.dumps(content, ensure_ascii=False) + "\n", encoding="utf-8")
+    text = json.dumps(content, ensure_ascii=False) + "\n"
+    path.write_text(text, encoding="utf-8", errors="replace")  # names of files may be any bytes
 
 
 def read_sources(path: Path, frames: NDArray[np.int32], parts: NDArray[np.int32]) -> Sources:

@@ -25,7 +25,7 @@ def _read(path: str) -> dict[str, Any]:
     parameters = content["parameters"]
     point, stated = parameters["POINT"], parameters.get("PROCESSING", {})
     labels = [
-        str(name).strip()
+        _decoded(name).strip()
         for key in ("LABELS", "LABELS2", "LABELS3", "LABELS4")
         for name in (point[key]["value"] if key in point else ())
     ]
@@ -38,6 +38,15 @@ def _read(path: str) -> dict[str, Any]:
         "stated": np.array(list(stated), dtype=str),
         "values": np.array([_number(stated, name) for name in stated], dtype=np.float64),
     }
+
+
+def _decoded(name: str) -> str:
+    """A name as ezc3d gives it, in UTF-8 or, as most programs write it, in Latin-1."""
+    content = name.encode("utf-8", "surrogateescape")
+    try:
+        return content.decode("utf-8")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
 
 
 def _text(group: Any, name: str) -> str:

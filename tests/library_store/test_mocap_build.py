@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -145,6 +146,19 @@ def test_two_builds_are_the_same_bytes(mocap: Mocap, directory: Path, tmp_path: 
     build_library(tmp_path / "own", None, SETTINGS, mocap=mocap)
     for name in (*CONTENT_FILES, MANIFEST):
         assert (tmp_path / "own" / name).read_bytes() == (directory / name).read_bytes()
+
+
+def test_names_that_are_no_text_are_kept_readable(tmp_path: Path) -> None:
+    """File names on Linux may be any bytes, and actions and subjects come of them."""
+    name = os.fsdecode(b"caf\xe9")
+    odd = replace(clip(name, 40, 1), subject=name, action=name)
+    mocap = Mocap((write_clips(tmp_path / f"{name}.npz", odd),), EVERY_FRAME)
+    build_library(tmp_path / "odd", None, replace(SETTINGS, n_poses=40), mocap=mocap)
+    library = load(tmp_path / "odd")
+    source = library.source(0)
+    assert (source.clip, source.subject, source.action) == ("caf", "caf?", "caf?")
+    assert [it.source for it in library.licences(0)] == ["caf?.npz"]
+    verify_library(tmp_path / "odd")
 
 
 def test_the_manifest_has_the_parameters_of_every_step(own: Library) -> None:

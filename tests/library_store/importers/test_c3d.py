@@ -69,6 +69,13 @@ def test_two_people_are_two_clips(tmp_path: Path) -> None:
     assert_allclose(clips[1].positions_mm, clips[0].positions_mm + beside, atol=0.01)
 
 
+def test_names_in_latin_1(tmp_path: Path) -> None:
+    path = write_c3d(tmp_path / "a.c3d", {f"J_rg:{name}": it for name, it in TRACKS.items()})
+    path.write_bytes(path.read_bytes().replace(b"J_rg", "Jörg".encode("latin-1")))
+    (clip,) = read(path)
+    assert clip.subject == "Jörg"
+
+
 def test_who_is_left_out_is_said(tmp_path: Path) -> None:
     ann = {f"Ann:{name}": track for name, track in TRACKS.items()}
     box = {"Box:corner": TRACKS["C7"], "*110": TRACKS["T10"]}
