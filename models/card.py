@@ -194,6 +194,11 @@ def read_card(path: Path) -> ModelCard:
     return card
 
 
+def printable(name: str) -> str:
+    """A file's name as cards can have it: bytes that are no UTF-8 become question marks."""
+    return name.encode(errors="replace").decode()
+
+
 def write_card(path: Path, card: ModelCard) -> None:
     """Write a card as people read it, checked once more; the old one stays until it is whole."""
     _write([(path, _text(card))])

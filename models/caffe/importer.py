@@ -15,7 +15,7 @@ from library_store.skeleton import LSP14
 from models.caffe.caffemodel import read_caffemodel
 from models.caffe.graph import Graph, build
 from models.caffe.net import read_net
-from models.card import ModelCard, PoseOutput, write_network
+from models.card import ModelCard, PoseOutput, printable, write_network
 from models.errors import CaffeError
 from models.session import OnnxModel
 
@@ -71,7 +71,8 @@ def import_caffe(
     except CaffeError as error:
         raise CaffeError(f"{prototxt} with {caffemodel.name}: {error}") from error
     source = hashlib.sha256(caffemodel.read_bytes()).hexdigest()
-    card = _card(graph, name, caffemodel.stem, f"{caffemodel.name} (sha256 {source})", licence)
+    stem, file = printable(caffemodel.stem), printable(caffemodel.name)
+    card = _card(graph, name, stem, f"{file} (sha256 {source})", licence)
     card = write_network(out, graph.data, card)
     OnnxModel(out, name)  # what was written is what the card says and runs
     return card

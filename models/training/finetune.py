@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from models.card import ModelCard, PoseOutput, read_card, write_card
+from models.card import ModelCard, PoseOutput, printable, read_card, write_card
 from models.card import read_weights as read_file
 from models.errors import AnnotationError, ModelError
 from models.heatmaps import read_maps
@@ -223,6 +223,7 @@ def _publish(
 ) -> ModelCard:
     """Write the network and its card, which says what it has from the one it began as."""
     old, size = begin.card, begin.output.input_px
+    source = printable(source)
     fresh = pose_card(network, name, f"{old.version}+{name}", size)
     inherited = {
         "output": _calibration_inherited(begin.output, old.name),

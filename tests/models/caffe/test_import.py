@@ -6,6 +6,7 @@ Against plain numpy here; at 368 px and in full depth against torch, where there
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -138,6 +139,8 @@ def test_the_card_says_whose_weights_they_are(tmp_path: Path) -> None:
     assert "non-commercial" in import_caffe(*paths, tmp_path).licence
     assert "pose_iter_1.caffemodel (sha256 " in card.description
     assert json.loads((tmp_path / "cpm-lsp.json").read_text())["output"]["maps"] == "beliefs"
+    in_latin_1 = paths[1].rename(tmp_path / os.fsdecode(b"modell_gr\xf6\xdfer.caffemodel"))
+    assert import_caffe(paths[0], in_latin_1, tmp_path).version == "modell_gr??er"
 
 
 def test_input_layers_separate_inputs_and_training_layers_are_understood(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -60,13 +61,13 @@ def test_it_learns_a_users_people_and_serves_by_card(start: Path, tmp_path: Path
         start="start",
         out=tmp_path / "out",
         name="ours",
-        source="drawings",
+        source=os.fsdecode(b"dessins d'\xe9t\xe9"),
         settings=FinetuneSettings(steps=60, lr=4e-3, hold_out=0.25, threads=1),
     )
     assert result.n_trained + result.n_held_out <= len(crops)
     assert result.after > result.before + 0.15, "people of one kind are learned quickly"
     assert result.card.measured["pck_0.2/held_out/after"] == round(result.after, 4)
-    assert result.card.training_data[-1] == "drawings"
+    assert result.card.training_data[-1] == "dessins d'?t?", "a name that is no UTF-8"
     estimator = PoseEstimator("ours", weights_dir=tmp_path / "out")
     joints = estimator.estimate(np.zeros((80, 80, 3), np.uint8), [PersonBox(8, 8, 60, 60, 1.0)])
     assert joints[0].positions_px.shape == (14, 2)
