@@ -12,11 +12,11 @@ from models.heatmaps import Floats, Joints2D
 from models.person_detector import PersonBox
 
 _MIRROR = np.array(LSP14.mirror)
-SURE_JOINTS, LEAST_BELIEF = 5, 0.31
+SURE_JOINTS, LEAST_BELIEF = 5, 0.28
 """Least product of the box's score and the mean confidence of that many best joints. Of a face and
 shoulders alone five joints are sure; of a chair or a raised arm the two networks seldom err
 together, where either alone would. It keeps 99.4% of the boxes that a teacher confirms in 350
-scenes; in mosaics, where half the people are tiny or cut off, it keeps 88% of the people's and
+scenes; in mosaics, where half the people are tiny or cut off, it keeps 89% of the people's and
 drops two thirds of those that show nobody (docs/experiments.md)."""
 SAME_PERSON = 0.1
 """Mean distance of two people's joints, over the larger extent, below which they are one."""
