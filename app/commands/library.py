@@ -25,6 +25,7 @@ from library_store.build import (
     verify_library,
 )
 from library_store.importers import Clip, find_files, read_each, states_licence, write_npz
+from library_store.importers.clip import counted
 from library_store.library import load
 from library_store.manifest import MANIFEST, Manifest
 from library_store.merge import merge_libraries
@@ -367,7 +368,7 @@ def import_mocap(
     write_npz(out, kept)
     output.print(_clips_table(kept))
     poses = sum(len(clip) for clip in kept)
-    total = f"{len(kept)} clips, {poses} poses; {n_skipped} skipped"
+    total = f"{counted(len(kept), 'clip')}, {counted(poses, 'pose')}; {n_skipped} skipped"
     output.print(f"{out}: {total}", highlight=False, markup=False, soft_wrap=True)
 
 

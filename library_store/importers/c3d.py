@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from library_store.importers.asf_amc import CMU_LICENCE, describe_cmu
 from library_store.importers.checks import checked_or_error, unit_scale
-from library_store.importers.clip import Clip, Float, MocapError
+from library_store.importers.clip import Clip, Float, MocapError, counted
 from library_store.importers.joint_tables import JointMapping, read_mapping
 from library_store.importers.markers import (
     MARKER_SETS,
@@ -209,7 +209,7 @@ def _joints_of(
         int(np.isnan(markers[marker][:, 0]).sum() - np.isnan(filled[marker][:, 0]).sum())
         for marker in filled
     )
-    findings = [f"{n_filled} marker positions in short gaps filled"] if n_filled else []
+    findings = [f"{counted(n_filled, 'marker position')} in short gaps filled"] if n_filled else []
     if table is not None:
         means = [np.mean([filled[it] for it in names], axis=0) for names in own]
         return np.stack(means, axis=1), name, findings

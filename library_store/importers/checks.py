@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from library_store.anatomy import LENGTHS, measure_lengths, root_of, unit
-from library_store.importers.clip import Clip, Float, Frames, MocapError
+from library_store.importers.clip import Clip, Float, Frames, MocapError, counted
 from library_store.importers.rotation import up_to_y
 from library_store.skeleton import (
     L_ANKLE,
@@ -110,7 +110,8 @@ def checked(
         clip = replace(clip, frame_rate_hz=math.nan)
     keep = np.isfinite(positions).all(axis=(1, 2))
     if not keep.all():
-        findings.append(f"{np.count_nonzero(~keep)} frames with missing joints dropped")
+        lost = counted(int(np.count_nonzero(~keep)), "frame")
+        findings.append(f"{lost} with missing joints dropped")
     if not keep.any():
         seen = np.flatnonzero(np.isfinite(positions).all(axis=2).any(axis=0))
         names = [name for joint, name in enumerate(LSP14.joint_names) if joint not in seen]

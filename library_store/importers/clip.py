@@ -67,3 +67,8 @@ class Clip:
             positions_mm=self.positions_mm[::step],
             frames=self.frames[::step],
         )
+
+
+def counted(n: int, noun: str) -> str:
+    """``1 frame``, ``2 frames``: for findings."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"

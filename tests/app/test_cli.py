@@ -16,9 +16,12 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from app.cli import cli
+from app.commands.bench import measure
 from app.commands.predict import picture_targets, read_photo
+from app.engine import load_engine
 from app.errors import InvalidInputError
 from app.schemas import BatchItem, PosesAnswer
+from app.settings import Settings
 from app.version import VERSION
 from library_store.errors import LibraryError
 from tests.app.conftest import RENDERS
@@ -201,6 +204,13 @@ def test_bench(library_dir: Path) -> None:
     assert "photos a second" in table.stdout
 
 
+def test_bench_measures_once_however_little_time_there_is(library_dir: Path, photo: bytes) -> None:
+    engine = load_engine(Settings(library_dir=library_dir))
+    speed = measure(engine, photo, threads=2, seconds=0.0)
+    assert speed.photos == 2
+    assert 0 < speed.median_ms <= speed.p95_ms
+
+
 def test_evaluate_lists_and_runs_programs(library_dir: Path, tmp_path: Path) -> None:
     listed = invoke("evaluate")
     assert listed.exit_code == 0
@@ -243,7 +253,7 @@ def test_library_import(tmp_path: Path) -> None:
     out.parent.mkdir()
     done = run("library", "import", tmp_path, "--out", out)
     assert done.returncode == 0, done.stderr
-    assert "1 clips, 3 poses; 1 skipped" in done.stdout
+    assert "1 clip, 3 poses; 1 skipped" in done.stdout
     assert "bad.bvh: not a BVH file" in done.stderr
     with np.load(out) as written:
         assert written["positions"].shape == (3, 14, 3)

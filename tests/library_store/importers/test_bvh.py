@@ -192,7 +192,7 @@ def test_a_frame_with_a_number_that_is_none_is_dropped(tmp_path: Path, value: st
     lines[-4] = " ".join([*words[:7], value, *words[8:]])
     (truth,) = read(write(tmp_path / "whole.bvh", text))
     (clip,) = read(write(tmp_path / "gap.bvh", "\n".join(lines)))
-    assert "1 frames with missing joints dropped" in clip.findings
+    assert "1 frame with missing joints dropped" in clip.findings
     kept = np.isin(truth.frames, clip.frames)
     assert np.count_nonzero(~kept) == 1
     assert_allclose(clip.positions_mm, truth.positions_mm[kept], atol=0.5)

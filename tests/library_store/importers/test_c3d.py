@@ -106,6 +106,13 @@ def test_a_person_never_seen_is_named_and_skipped(tmp_path: Path) -> None:
         read(path)
 
 
+def test_a_single_gap_is_one(tmp_path: Path) -> None:
+    tracks = {name: track.copy() for name, track in TRACKS.items()}
+    tracks["LKNE"][10] = np.nan
+    (clip,) = read(write_c3d(tmp_path / "a.c3d", tracks))
+    assert "1 marker position in short gaps filled" in clip.findings
+
+
 def test_an_axis_that_is_not_stated_is_found(tmp_path: Path) -> None:
     (clip,) = read(write_c3d(tmp_path / "a.c3d", TRACKS, up=""))
     assert any("turned so that Y is up" in finding for finding in clip.findings)
