@@ -26,6 +26,7 @@ import cv2
 import numpy as np
 
 from benchmarks.service import DEFAULT_PHOTO, Service, given_or_started, started_service
+from library_store.arguments import SEED, integer, real
 
 DOCUMENTED = {200, 400, 413, 415, 422}
 PATIENCE_S = 60.0
@@ -58,12 +59,12 @@ def main() -> None:
     """Parse the command line, fuzz, print."""
     parser = argparse.ArgumentParser(description="Fuzz the service with damaged photos.")
     parser.add_argument("--url", help="fuzz this server instead of starting one")
-    parser.add_argument("--pid", type=int, help="its process (with --url)")
-    parser.add_argument("--seconds", type=float, default=120.0, help="at most 3600")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--pid", type=integer(1), help="its process (with --url)")
+    parser.add_argument("--seconds", type=real(0.1, 3600), default=120.0)
+    parser.add_argument("--seed", type=SEED, default=1)
     parser.add_argument("--out", type=Path, default=Path("fuzz-finding.bin"))
     arguments = parser.parse_args()
-    end = time.monotonic() + min(arguments.seconds, 3600.0)
+    end = time.monotonic() + arguments.seconds
     cases = iterate_cases(np.random.default_rng(arguments.seed), make_seeds())
     with tempfile.TemporaryDirectory() as scratch:
         temporary = Path(scratch)

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from app.engine import milvus_of
 from app.settings import load_settings
+from library_store.arguments import integer
 from library_store.backends import Backend
 from library_store.cameras import project, rolled_upright, sample_cameras
 from library_store.library import Library, load
@@ -69,9 +70,9 @@ def main() -> None:
     parser.add_argument("libraries", type=Path, nargs="+")
     parser.add_argument("--backends", nargs="+", choices=get_args(Backend), default=["cells"])
     parser.add_argument("--queries", nargs="+", default=[], metavar="FILE:KEY")
-    parser.add_argument("--count", type=int, default=100, help="queries of each case")
+    parser.add_argument("--count", type=integer(1), default=100, help="queries of each case")
     parser.add_argument("--cases", nargs="+", default=[], help="of the tables' first column")
-    parser.add_argument("--passes", type=int, default=3, help="how often each is asked")
+    parser.add_argument("--passes", type=integer(1), default=3, help="how often each is asked")
     arguments = parser.parse_args()
     points = read_queries(arguments.queries, arguments.count)
     cases = {

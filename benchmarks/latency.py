@@ -19,19 +19,20 @@ import numpy as np
 
 from benchmarks.load import Load, closed_loop, encode_request
 from benchmarks.service import DEFAULT_PHOTO, given_or_started
+from library_store.arguments import integer, real
 
 
 def main() -> None:
     """Parse the command line, measure, print."""
     parser = argparse.ArgumentParser(description="Latency and throughput over HTTP.")
     parser.add_argument("--url", help="measure this server instead of starting one")
-    parser.add_argument("--pid", type=int, help="its process (with --url)")
+    parser.add_argument("--pid", type=integer(1), help="its process (with --url)")
     parser.add_argument("--photo", type=Path, nargs="+", default=[DEFAULT_PHOTO])
     parser.add_argument("--query", default="", help="query string, such as max_people=1")
-    parser.add_argument("--concurrency", type=int, nargs="+", default=[1, 8])
-    parser.add_argument("--seconds", type=float, default=10.0, help="per concurrency, at most 120")
+    parser.add_argument("--concurrency", type=integer(1), nargs="+", default=[1, 8])
+    parser.add_argument("--seconds", type=real(0.5, 120), default=10.0, help="per concurrency")
     arguments = parser.parse_args()
-    seconds = min(max(arguments.seconds, 0.5), 120.0)
+    seconds: float = arguments.seconds
     with given_or_started(arguments.url, arguments.pid) as service:
         if service.ready_s is not None:
             print(f"ready {service.ready_s:.1f} s after start; {os.cpu_count()} cores")

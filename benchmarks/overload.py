@@ -22,6 +22,7 @@ import numpy as np
 
 from benchmarks.load import Load, closed_loop, encode_request, open_loop
 from benchmarks.service import DEFAULT_PHOTO, Service, given_or_started
+from library_store.arguments import integer, real
 
 WANTED_GOODPUT = 0.9
 
@@ -30,13 +31,15 @@ def main() -> None:
     """Parse the command line, measure, print, judge."""
     parser = argparse.ArgumentParser(description="Behaviour under overload.")
     parser.add_argument("--url", help="measure this server instead of starting one")
-    parser.add_argument("--pid", type=int, help="its process (with --url)")
+    parser.add_argument("--pid", type=integer(1), help="its process (with --url)")
     parser.add_argument("--photo", type=Path, default=DEFAULT_PHOTO)
-    parser.add_argument("--times", type=float, default=4.0, help="offered load over capacity")
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each load, at most 300")
-    parser.add_argument("--rounds", type=int, default=5, help="of capacity and overload in turn")
+    parser.add_argument("--times", type=real(0.1), default=4.0, help="offered load over capacity")
+    parser.add_argument("--seconds", type=real(1, 300), default=10.0, help="of each load")
+    parser.add_argument(
+        "--rounds", type=integer(1), default=5, help="of capacity and overload in turn"
+    )
     arguments = parser.parse_args()
-    seconds = min(max(arguments.seconds, 1.0), 300.0)
+    seconds: float = arguments.seconds
     with given_or_started(arguments.url, arguments.pid) as service:
         request = encode_request(service, arguments.photo.read_bytes())
         closed_loop(service, request, 2, seconds=2.0)  # warm up

@@ -26,6 +26,7 @@ import cv2
 import numpy as np
 
 from benchmarks.service import DEFAULT_PHOTO
+from library_store.arguments import integer
 from models.training.teachers import BlazePose
 
 Answer = Callable[[bytes], object]
@@ -39,7 +40,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Beside MediaPipe Pose's networks.")
     parser.add_argument("--reference", type=Path, required=True)
     parser.add_argument("--photo", type=Path, nargs="+", default=[DEFAULT_PHOTO])
-    parser.add_argument("--runs", type=int, default=50)
+    parser.add_argument("--runs", type=integer(1), default=50)
     parser.add_argument("--only", choices=list(CONTENDERS), help="measure one; prints JSON")
     arguments = parser.parse_args()
     if arguments.only:

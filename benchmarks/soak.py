@@ -23,6 +23,7 @@ import numpy as np
 
 from benchmarks.load import Connection, Load, encode_request
 from benchmarks.service import DEFAULT_PHOTO, Service, given_or_started
+from library_store.arguments import integer, real
 
 EXPECTED = {200, 413, 415, 422, 503}
 
@@ -51,14 +52,15 @@ def main() -> None:
     """Parse the command line, soak, print, judge."""
     parser = argparse.ArgumentParser(description="Full load for a long time.")
     parser.add_argument("--url", help="soak this server instead of starting one")
-    parser.add_argument("--pid", type=int, help="its process (with --url)")
-    parser.add_argument("--minutes", type=float, default=15.0, help="at most 120")
-    parser.add_argument("--concurrency", type=int, default=8)
+    parser.add_argument("--pid", type=integer(1), help="its process (with --url)")
+    parser.add_argument("--minutes", type=real(0.1, 120), default=15.0)
+    parser.add_argument("--concurrency", type=integer(1), default=8)
     arguments = parser.parse_args()
-    minutes = min(max(arguments.minutes, 0.1), 120.0)
     with given_or_started(arguments.url, arguments.pid) as service:
         requests = [encode_request(service, photo) for photo in make_photos()]
-        history = asyncio.run(soak(service, requests, arguments.concurrency, 60 * minutes))
+        history = asyncio.run(
+            soak(service, requests, arguments.concurrency, 60 * arguments.minutes)
+        )
     judge(history)
 
 

@@ -19,6 +19,7 @@ from app.engine import Engine, load_engine
 from app.pipeline import PhotoQuery, StageClock
 from app.settings import load_settings
 from benchmarks.service import DEFAULT_PHOTO
+from library_store.arguments import integer
 
 _WARM_UP_RUNS = 5
 
@@ -27,8 +28,8 @@ def main() -> None:
     """Parse the command line, measure, print."""
     parser = argparse.ArgumentParser(description="CPU time per stage.")
     parser.add_argument("--photo", type=Path, nargs="+", default=[DEFAULT_PHOTO])
-    parser.add_argument("--runs", type=int, default=50)
-    parser.add_argument("--max-people", type=int, default=5)
+    parser.add_argument("--runs", type=integer(1), default=50)
+    parser.add_argument("--max-people", type=integer(1), default=5)
     arguments = parser.parse_args()
     engine = load_engine(load_settings())
     query = PhotoQuery(max_people=arguments.max_people)

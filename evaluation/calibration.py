@@ -24,6 +24,7 @@ from evaluation.lifting import Lifted, lift_all
 from evaluation.metrics import Floats, rigid_error_mm, root_centred_error_mm
 from evaluation.networks import SHIPPED, add_network_option, network_of
 from evaluation.protocols import LiftingSet, clean, load_lifting_set
+from library_store.arguments import integer
 from library_store.library import Library, load
 from library_store.skeleton import LSP14
 from models.pose_lifter import PoseLifter
@@ -196,7 +197,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         help="another library, with the shipped network, and set to check on",
     )
     parser.add_argument("--search", action="store_true", help="try other values of eq. 4's sigma")
-    parser.add_argument("--people", type=int, default=None, help="only the first N of each set")
+    parser.add_argument(
+        "--people", type=integer(1), default=None, help="only the first N of each set"
+    )
     add_network_option(parser)
     chosen = parser.parse_args(arguments)
     served, settings = Served.of(chosen.library, chosen.network), LiftingSettings()

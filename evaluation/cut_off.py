@@ -29,6 +29,7 @@ from app.settings import load_settings
 from evaluation.metrics import Floats, similarity_error_mm
 from evaluation.pose2d import held_out_photos
 from evaluation.progress import followed
+from library_store.arguments import integer
 from library_store.skeleton import (
     L_ANKLE,
     L_HIP,
@@ -149,7 +150,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     of = parser.add_mutually_exclusive_group(required=True)
     of.add_argument("--renders", type=Path, help="tar of models.training.rendered")
     of.add_argument("--data", type=Path, help="folder with photos_*.tar")
-    parser.add_argument("--people", type=int, default=150)
+    parser.add_argument("--people", type=integer(1), default=150)
     chosen = parser.parse_args(arguments)
     everybody = rendered(chosen.renders) if chosen.renders else photographed(chosen.data)
     people = list(islice((person for person in everybody if person.upright), chosen.people))

@@ -21,6 +21,7 @@ from app.lifting.types import Intrinsics, LiftedPerson, Method, NotLiftable
 from evaluation.metrics import Floats, Summary, root_centred_error_mm, summarise
 from evaluation.networks import add_network_option, network_of
 from evaluation.protocols import SPOILERS, LiftingSet, Spoilt, load_lifting_set
+from library_store.arguments import integer
 from library_store.library import load
 
 METHODS: tuple[Method, ...] = ("paper", "fusion")
@@ -123,7 +124,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--data", type=Path, action="append", required=True, help=".npz, repeatable"
     )
-    parser.add_argument("--people", type=int, default=None, help="only the first N of each set")
+    parser.add_argument(
+        "--people", type=integer(1), default=None, help="only the first N of each set"
+    )
     parser.add_argument(
         "--stated-noise",
         action="store_true",

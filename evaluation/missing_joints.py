@@ -23,6 +23,7 @@ from evaluation.networks import add_network_option
 from evaluation.photo_sigma import Answers, Seen, lift
 from evaluation.progress import followed
 from evaluation.protocols import LiftingSet, clean, load_lifting_set
+from library_store.arguments import integer
 from library_store.skeleton import LSP14
 
 
@@ -94,7 +95,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="evaluation.missing_joints", description=__doc__)
     parser.add_argument("--library", type=Path, required=True)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--every", type=int, default=10, help="of the people, for time's sake")
+    parser.add_argument(
+        "--every", type=integer(1), default=10, help="of the people, for time's sake"
+    )
     add_network_option(parser)
     chosen = parser.parse_args(arguments)
     served = Served.of(chosen.library, chosen.network)

@@ -30,6 +30,7 @@ from evaluation.pose2d import (
     true_square,
 )
 from evaluation.progress import followed
+from library_store.arguments import SEED, integer
 from library_store.skeleton import LIMB_JOINTS, LSP14
 from models.pck import correct_keypoints, torso_px
 from models.training.cutout import over, place, silhouette, whole
@@ -154,8 +155,8 @@ def main() -> None:
     parser.add_argument("--reference", type=Path, required=True)
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--name", default="cpm-int8")
-    parser.add_argument("--pairs", type=int, default=300, help="of each set")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--pairs", type=integer(1), default=300, help="of each set")
+    parser.add_argument("--seed", type=SEED, default=0)
     args = parser.parse_args()
     cv2.setNumThreads(1)
     rng = np.random.default_rng(args.seed)

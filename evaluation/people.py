@@ -25,6 +25,7 @@ from app.engine import chosen_networks
 from app.settings import load_settings
 from evaluation.pose2d import held_out_photos
 from evaluation.progress import followed
+from library_store.arguments import SEED
 from models import PersonBox, PersonDetector, PoseEstimator
 from models.person_detector import Floats, corners, iou
 from models.presence import present
@@ -163,7 +164,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--labels", type=Path, required=True)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=SEED, default=0)
     args = parser.parse_args()
     cv2.setNumThreads(1)
     rng = np.random.default_rng(args.seed)

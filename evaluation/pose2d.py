@@ -26,6 +26,7 @@ import numpy as np
 
 from evaluation.metrics import Floats
 from evaluation.progress import followed
+from library_store.arguments import integer
 from library_store.skeleton import LIMB_JOINTS, LSP14
 from models import PersonBox, PoseEstimator
 from models.crop import square_crop
@@ -233,7 +234,7 @@ def main() -> None:
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--name", default="cpm-int8")
     parser.add_argument(
-        "--photos", type=int, default=100_000, help="at most so many held-out photos"
+        "--photos", type=integer(1), default=100_000, help="at most so many held-out photos"
     )
     args = parser.parse_args()
     cv2.setNumThreads(1)

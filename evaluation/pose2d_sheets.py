@@ -17,6 +17,7 @@ import numpy as np
 from evaluation.metrics import Floats
 from evaluation.pose2d import SCALE, held_out_photos, networks
 from evaluation.progress import followed
+from library_store.arguments import SEED, integer
 from library_store.sheet import draw_bone
 from library_store.skeleton import LSP14
 from models.training.augment import crop_matrix
@@ -45,8 +46,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--name", default="cpm-int8")
-    parser.add_argument("--people", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--people", type=integer(1), default=200)
+    parser.add_argument("--seed", type=SEED, default=0)
     args = parser.parse_args()
     cv2.setNumThreads(1)
     crops = held_out_photos(args.data)

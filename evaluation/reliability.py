@@ -34,6 +34,7 @@ from evaluation.metrics import (
 )
 from evaluation.networks import add_network_option, network_of
 from evaluation.protocols import LiftingSet, clean, load_lifting_set, one_corrupted, one_missing
+from library_store.arguments import integer
 from library_store.library import load
 from library_store.skeleton import L_HIP, LSP14, NECK, R_HIP
 
@@ -222,7 +223,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--data", type=Path, action="append", required=True, help=".npz, repeatable"
     )
-    parser.add_argument("--people", type=int, default=None, help="only the first N of each set")
+    parser.add_argument(
+        "--people", type=integer(1), default=None, help="only the first N of each set"
+    )
     add_network_option(parser)
     chosen = parser.parse_args(arguments)
     library = load(chosen.library)

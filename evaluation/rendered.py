@@ -24,6 +24,7 @@ from app.settings import load_settings
 from evaluation.metrics import Floats, similarity_error_mm
 from evaluation.photo_sigma import Seen, find_joints
 from evaluation.progress import followed
+from library_store.arguments import integer
 from library_store.skeleton import LIMB_JOINTS
 from models.pck import correct_keypoints
 from models.training.dataset import MP33_LIMBS, Image, decode_members, read_annotations
@@ -66,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="evaluation.rendered", description=__doc__)
     parser.add_argument("--renders", type=Path, required=True)
     parser.add_argument("--reference", type=Path, help="folder with blazepose_*.onnx")
-    parser.add_argument("--people", type=int, help="only the first so many")
+    parser.add_argument("--people", type=integer(1), help="only the first so many")
     chosen = parser.parse_args(arguments)
     engine = load_engine(load_settings())
     people = list(find_joints(chosen.renders, engine.estimator))[: chosen.people]

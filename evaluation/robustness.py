@@ -24,6 +24,7 @@ from evaluation.metrics import Floats
 from evaluation.people import SAME
 from evaluation.pose2d import held_out_photos
 from evaluation.progress import followed
+from library_store.arguments import integer
 from models.pck import correct_keypoints
 from models.person_detector import iou
 from models.training.augment import MIRROR
@@ -172,7 +173,7 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", type=Path, required=True)
-    parser.add_argument("--every", type=int, default=4)
+    parser.add_argument("--every", type=integer(1), default=4)
     args = parser.parse_args()
     cv2.setNumThreads(1)
     crops = [crop for crop in held_out_photos(args.data)[:: max(1, args.every)] if crop.has_torso]

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from library_store.arguments import integer
 from library_store.cameras import extrinsics
 from library_store.prior import DEFAULT_PRIOR, KINDS, PosePrior
 from library_store.sheet import BACKGROUND, TEXT, TILE_PX, draw_pose
@@ -61,7 +62,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--prior", type=Path, default=DEFAULT_PRIOR)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--columns", type=int, default=10)
+    parser.add_argument("--columns", type=integer(1), default=10)
     arguments = parser.parse_args()
     sheet = prior_sheet(PosePrior.load(arguments.prior), arguments.columns)
     half = cv2.resize(sheet, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)

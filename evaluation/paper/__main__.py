@@ -24,6 +24,7 @@ from evaluation.networks import OFF, SHIPPED, network_named, network_of
 from evaluation.paper.network import Network
 from evaluation.paper.runs import Options, run_cmu, run_users_data
 from evaluation.protocols import load_lifting_set
+from library_store.arguments import SEED, integer, real
 from library_store.library import load
 
 
@@ -37,16 +38,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add = parser.add_argument
     add("--data", required=True, help="a folder, or the word cmu")
     add("--out", type=Path, default=Path("paper-tables"), help="report.md, figures, libraries")
-    add("--entries", type=int, default=200_000, help="training frames in a library; 0: all")
-    add("--views", type=int, default=5_000, help="test views a protocol, drawn; 0: all")
-    add("--curve-views", type=int, default=1_000, help="the same for figures 7 and 8")
-    add("--seed", type=int, default=0, help="of everything that is drawn")
+    add("--entries", type=integer(0), default=200_000, help="training frames in a library; 0: all")
+    add("--views", type=integer(0), default=5_000, help="test views a protocol, drawn; 0: all")
+    add("--curve-views", type=integer(0), default=1_000, help="the same for figures 7 and 8")
+    add("--seed", type=SEED, default=0, help="of everything that is drawn")
     add("--library", type=Path, help="a library of posematch's own, for further rows")
     add("--mlp", type=Path, help="what evaluation.paper.mlp trained on it, for further rows")
     add("--network", help="card of the lifting network, or off; default see above")
     add("--mocap", type=Path, help="with --data cmu: the generic npz of CMU's poses")
     add("--cross-set", type=Path, help="with --data cmu: people of another set (lifting npz)")
-    add("--noise-px", type=float, default=10.0, help="with --data cmu: what stands for a network")
+    add(
+        "--noise-px",
+        type=real(0),
+        default=10.0,
+        help="with --data cmu: what stands for a network",
+    )
     chosen = parser.parse_args(arguments)
     for name in ("library", "mlp", "mocap", "cross_set"):
         path: Path | None = getattr(chosen, name)

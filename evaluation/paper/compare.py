@@ -20,6 +20,7 @@ from evaluation.paper.network import Network
 from evaluation.paper.systems import Seen2D, System, default_method, learned, paper_method
 from evaluation.paper.views import Views, of_lifting_set
 from evaluation.protocols import load_lifting_set, one_missing
+from library_store.arguments import integer
 from library_store.library import load
 
 
@@ -44,7 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--library", type=Path, required=True)
     parser.add_argument("--mlp", type=Path, required=True)
     parser.add_argument("--data", type=Path, action="append", required=True)
-    parser.add_argument("--people", type=int, default=None, help="only N, spread over each set")
+    parser.add_argument(
+        "--people", type=integer(1), default=None, help="only N, spread over each set"
+    )
     parser.add_argument("--only", action="append", help="a method; repeatable; default all")
     add_network_option(parser)
     chosen = parser.parse_args(arguments)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from app.lifting.geometry import Floats, Mask, normalised_projection
 from evaluation.paper.network import N_FEATURES, N_JOINTS, RMS_FLOOR, UNIT_MM, about_root, features
+from library_store.arguments import SEED, integer, real
 from library_store.cameras import extrinsics, sample_cameras
 from library_store.library import Library, load
 from library_store.skeleton import LIMB_JOINTS
@@ -171,10 +172,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="evaluation.paper.mlp", description=__doc__)
     parser.add_argument("--library", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True, help=".npz")
-    parser.add_argument("--minutes", type=float, default=30.0)
-    parser.add_argument("--width", type=int, default=1024)
-    parser.add_argument("--blocks", type=int, default=2)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--minutes", type=real(0.1), default=30.0)
+    parser.add_argument("--width", type=integer(1), default=1024)
+    parser.add_argument("--blocks", type=integer(0), default=2)
+    parser.add_argument("--seed", type=SEED, default=0)
     chosen = parser.parse_args(arguments)
     library = load(chosen.library, verify=False)
     n = train(library, chosen.width, chosen.blocks, chosen.minutes, chosen.seed, chosen.out)

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from library_store.arguments import SEED
 from library_store.skeleton import LIMB_JOINTS
 from models.card import (
     WEIGHTS_DIR,
@@ -153,7 +154,7 @@ def main() -> None:
     parser.add_argument("--name", default="cpm")
     parser.add_argument("--train", default="lspet_train_a,lspet_train_b,photos_a,photos_b")
     parser.add_argument("--test", default="lspet_val", help="measured too; several with commas")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=SEED, default=0)
     parser.add_argument("--figure", type=Path, help="draw the reliability diagram here (PNG)")
     args = parser.parse_args()
     cv2.setNumThreads(1)

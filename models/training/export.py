@@ -16,6 +16,7 @@ import torch
 from onnx import numpy_helper
 from torch import Tensor, nn
 
+from library_store.arguments import integer
 from library_store.skeleton import LSP14
 from models.card import WEIGHTS_DIR, DetectorOutput, ModelCard, PoseOutput, write_network
 from models.errors import ModelError
@@ -212,7 +213,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=WEIGHTS_DIR)
     parser.add_argument("--name", help="file name without its suffix; the network's by default")
     parser.add_argument("--version", required=True)
-    parser.add_argument("--input-px", type=int, help="crop side, or the photo's longer side")
+    parser.add_argument(
+        "--input-px", type=integer(32), help="crop side, or the photo's longer side"
+    )
     args = parser.parse_args()
     export(
         args.checkpoint,

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
+from library_store.arguments import SEED
 from library_store.skeleton import LSP14
 from library_store.upright import MOST_LEAN, lean_rad
 from models.card import WEIGHTS_DIR
@@ -253,7 +254,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--name", default="cpm-int8")
     parser.add_argument("--weights", type=Path, default=WEIGHTS_DIR)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=SEED, default=0)
     args = parser.parse_args()
     cv2.setNumThreads(1)
     estimator = PoseEstimator(args.name, weights_dir=args.weights)

@@ -22,6 +22,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
+from library_store.arguments import SEED, integer, real
 from models.errors import ModelError
 from models.training import optimizer as optim
 
@@ -37,14 +38,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, required=True, help="folder of this run; resumed if any"
     )
     parser.add_argument("--init", type=Path, help="start from this checkpoint or exported ONNX")
-    parser.add_argument("--steps", type=int, default=12000)
-    parser.add_argument("--minutes", type=float, help="bring the schedule to its end by then")
-    parser.add_argument("--batch", type=int, default=64)
-    parser.add_argument("--lr", type=float, default=2e-3, help="AdamW's; Muon's is ten times that")
+    parser.add_argument("--steps", type=integer(1), default=12000)
+    parser.add_argument("--minutes", type=real(0.1), help="bring the schedule to its end by then")
+    parser.add_argument("--batch", type=integer(1), default=64)
+    parser.add_argument(
+        "--lr", type=real(1e-7), default=2e-3, help="AdamW's; Muon's is ten times that"
+    )
     parser.add_argument("--optimizer", choices=["muon", "adamw"], default="muon")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--every", type=int, default=500, help="steps between evaluations")
+    parser.add_argument("--seed", type=SEED, default=0)
+    parser.add_argument("--threads", type=integer(1), default=2)
+    parser.add_argument("--every", type=integer(1), default=500, help="steps between evaluations")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
 
 
@@ -133,9 +136,15 @@ def _resume(
 ) -> tuple[int, float]:
     """Load a run's state: the steps done and the seconds they took.
 
-    ``SystemExit`` where the run was started with another network or optimizer.
+    ``SystemExit`` where the run was started with another network or optimizer, or the file is no
+    run's own, such as the average of several.
     """
     state = read_checkpoint(path, args.device)
+    if missing := sorted({"model", "optimizers", "spent_s"} - state.keys()):
+        raise SystemExit(
+            f"{path} cannot be resumed: no {', '.join(missing)}; start from it in another --out "
+            "(--init)"
+        )
     _load(path, state["model"], state["config"], model, config)
     ema.load_state_dict(state["ema"])
     if len(state["optimizers"]) != len(optimizers):

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
+from library_store.arguments import SEED
 from models.card import WEIGHTS_DIR
 from models.person_detector import PersonDetector, corners, iou
 from models.pose_estimator import PoseEstimator
@@ -53,7 +54,7 @@ def main() -> None:
     parser.add_argument("--weights", type=Path, default=WEIGHTS_DIR)
     parser.add_argument("--people", default="person-int8")
     parser.add_argument("--pose", default="cpm-int8")
-    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--seed", type=SEED, default=1)
     args = parser.parse_args()
     cv2.setNumThreads(1)
     rng = np.random.default_rng(args.seed)

@@ -31,6 +31,7 @@ from onnxruntime.quantization import (
     quantize_static,
 )
 
+from library_store.arguments import integer
 from models.card import WEIGHTS_DIR, DetectorOutput, ModelCard, PoseOutput, read_card
 from models.person_detector import PersonDetector, iou, shrunk
 from models.providers import INT8_FEATURES
@@ -266,7 +267,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--train", default="lspet_train_a,photos_a", help="crops to take ranges on")
     parser.add_argument("--scenes", default="photos_scenes.tar", help="for the person network")
-    parser.add_argument("--images", type=int, default=300)
+    parser.add_argument("--images", type=integer(1), default=300)
     args = parser.parse_args()
     cv2.setNumThreads(1)
 

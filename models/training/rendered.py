@@ -22,6 +22,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from library_store.arguments import SEED, integer
 from library_store.skeleton import LSP14
 from models.errors import AnnotationError
 from models.training.dataset import decode_members
@@ -142,10 +143,10 @@ def main() -> None:
     parser.add_argument("--people", type=Path, help="boxes of people in the backgrounds")
     parser.add_argument("--unseen", type=Path, help="ground_truth.json of test renders")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--count", type=int, default=5000)
-    parser.add_argument("--first", type=int, default=0, help="number of the first crop")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--count", type=integer(1), default=5000)
+    parser.add_argument("--first", type=integer(0), default=0, help="number of the first crop")
+    parser.add_argument("--jobs", type=integer(1), default=1)
+    parser.add_argument("--seed", type=SEED, default=0)
     args = parser.parse_args()
     studio = open_studio(args.body, args.mocap, args.backgrounds, args.unseen, args.people)
     numbers = range(args.first, args.first + args.count)

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from library_store.arguments import integer
 from models.pck import correct_keypoints
 from models.training import loop
 from models.training.augment import Sample, canonical, random_view
@@ -96,10 +97,10 @@ def main() -> None:
     parser.add_argument(
         "--sizes", default="96:0.3,128:0.7,160:1", help="input px:up to share of run"
     )
-    parser.add_argument("--width", type=int, default=32)
+    parser.add_argument("--width", type=integer(1), default=32)
     parser.add_argument("--blocks", default="2,3,4,3")
-    parser.add_argument("--stage-width", type=int, default=64)
-    parser.add_argument("--stages", type=int, default=3)
+    parser.add_argument("--stage-width", type=integer(1), default=64)
+    parser.add_argument("--stages", type=integer(1), default=3)
     parser.add_argument("--depths", type=Path, help="learn depths too; what depth_teacher wrote")
     parser.add_argument("--only-depths", action="store_true", help="all else stays as it is")
     args = parser.parse_args()

@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from library_store.arguments import SEED, real
 from library_store.prior import DEFAULT_PRIOR, PosePrior
 from library_store.skeleton import LSP14
 from models.card import WEIGHTS_DIR, LiftOutput, ModelCard
@@ -227,12 +228,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=WEIGHTS_DIR, help="for .onnx and .json")
     parser.add_argument("--name", default="lifter")
     parser.add_argument("--version", default="0.1.0")
-    parser.add_argument("--minutes", type=float, default=20.0)
-    parser.add_argument("--rate", type=float, default=RATE, help="of learning, at its highest")
+    parser.add_argument("--minutes", type=real(0.1), default=20.0)
+    parser.add_argument("--rate", type=real(1e-7), default=RATE, help="of learning, at its highest")
     parser.add_argument("--init", type=Path, help="go on from this .onnx of an earlier run")
     parser.add_argument("--mistakes", type=Path, help="what models.training.lifter_mistakes wrote")
     parser.add_argument("--found", help="name of the network for joints that are not all sure")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=SEED, default=0)
     chosen = parser.parse_args()
     prior = PosePrior.load(chosen.prior)
     rng = np.random.default_rng(chosen.seed)

@@ -148,3 +148,29 @@ def test_a_run_is_resumed_as_it_was_started_or_not_at_all(tmp_path: Path) -> Non
     assert loop.read_checkpoint(tmp_path / "last.pt")["step"] == 1
     run(2)
     assert loop.read_checkpoint(tmp_path / "last.pt")["step"] == 2
+
+
+def test_what_only_averages_is_a_start_and_no_run_to_resume(tmp_path: Path) -> None:
+    parser = argparse.ArgumentParser()
+    loop.add_arguments(parser)
+    model = torch.nn.Conv2d(3, 4, 3)
+    averages = {"ema": model.state_dict(), "config": {}, "step": 1}
+    torch.save(averages, tmp_path / "last.pt")
+
+    def run(out: Path, *options: str) -> None:
+        line = ["--data", "x", "--out", str(out), "--steps", "1", "--threads", "1", *options]
+        loop.fit(
+            torch.nn.Conv2d(3, 4, 3),
+            parser.parse_args([*line, "--device", "cpu", "--optimizer", "adamw"]),
+            sizes=[(1.0, 8)],
+            make_batch=lambda _, size: (torch.ones(4, 3, size, size),),
+            loss_of=lambda model, batch: model(batch[0]).pow(2).mean(),
+            evaluate=lambda _, __: {},
+            config={},
+        )
+
+    said = r"last\.pt cannot be resumed: no model, optimizers, spent_s; .*--init"
+    with pytest.raises(SystemExit, match=said):
+        run(tmp_path)
+    run(tmp_path / "anew", "--init", str(tmp_path / "last.pt"))
+    assert loop.read_checkpoint(tmp_path / "anew" / "last.pt")["step"] == 1
