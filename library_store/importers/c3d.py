@@ -101,15 +101,7 @@ def read(path: Path, *, mapping: Path | None = None) -> list[Clip | MocapError]:
         )
         clips.append(checked_or_error(path, clip, up_is_known=bool(file.up)))
     if not clips:
-        there = ", ".join(f"{p}:{m}" if p else m for p, ms in file.people.items() for m in ms)
-        known = "; ".join(f"{known.name} ({' '.join(known.markers)})" for known in MARKER_SETS)
-        advice = (
-            f"Known sets are {known}. Others need a mapping file: a JSON or TOML table from each "
-            "joint to a marker or a list of markers"
-            if table is None
-            else f"{table.name} names {', '.join(name for it in table.targets for name in it)}"
-        )
-        raise MocapError(path, f"markers are {there[:500] or 'none'}. {advice}")
+        raise MocapError(path, _nobody_in(file, table))
     if left_out:
         finding = f"left out, not the markers of a person: {', '.join(left_out)}"
         clips = [
@@ -181,6 +173,21 @@ def _frame_range(path: Path, file: BinaryIO) -> tuple[int, int]:
         )
     first, last = struct.unpack_from("<HH", header, 6)
     return first, last
+
+
+def _nobody_in(file: C3dFile, table: JointMapping | None) -> str:
+    """Which markers there are, and which were looked for."""
+    there = ", ".join(f"{p}:{m}" if p else m for p, ms in file.people.items() for m in ms)
+    if table is not None:
+        wanted = ", ".join(name for it in table.targets for name in it)
+        advice = f"{table.name} names {wanted}"
+    else:
+        known = "; ".join(f"{known.name} ({' '.join(known.markers)})" for known in MARKER_SETS)
+        advice = (
+            f"Known sets are {known}. Others need a mapping file: a JSON or TOML table from each "
+            "joint to a marker or a list of markers"
+        )
+    return f"markers are {there[:500] or 'none'}. {advice}"
 
 
 def _joints_of(
