@@ -36,5 +36,6 @@ def _reader(kind: Callable[[str], T], name: str, least: T, most: float) -> Calla
     return read
 
 
-SEED = integer(0, 2**63 - 1)
-"""The seeds that NumPy and torch both take."""
+MAX_SEED = 2**63 - 1
+"""The highest seed that NumPy and torch both take."""
+SEED = integer(0, MAX_SEED)

@@ -15,6 +15,7 @@ from rich.table import Table
 from app.commands.console import output, print_json
 from app.engine import chosen_networks
 from app.settings import Settings, load_settings
+from library_store.arguments import MAX_SEED
 from models import ModelCard, ModelError, ProviderChoice
 from models.caffe import LICENCE, JointOrder
 from models.caffe import import_caffe as import_network
@@ -173,7 +174,7 @@ def finetune(
     minutes: Annotated[float | None, typer.Option(min=0.1, help="End by then.")] = None,
     lr: Annotated[float, typer.Option(min=1e-7, max=1e-1, help="Learning rate.")] = 3e-4,
     hold_out: Annotated[float, typer.Option(min=0.01, max=0.9, help="Share of images.")] = 0.15,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=MAX_SEED)] = 0,
     threads: Annotated[int, typer.Option(min=1)] = 2,
 ) -> None:
     """Train the pose network further on your own labelled images.

@@ -78,6 +78,14 @@ def test_finetune_wants_one_kind_of_labels(tmp_path: Path) -> None:
         assert invoke("finetune", "--out", tmp_path / "out", *given).exit_code == 2
 
 
+def test_finetune_refuses_a_seed_that_torch_does_not_take(tmp_path: Path) -> None:
+    path = user_files.write(tmp_path / "labels.json", user_files.coco(tmp_path / "images", 1))
+    given = ["--coco", path, "--images", tmp_path / "images", "--out", tmp_path / "out"]
+    result = invoke("finetune", *given, "--seed", 2**63)
+    assert result.exit_code == 2
+    assert "--seed" in result.output
+
+
 def test_import_caffe_makes_a_directory_that_can_be_served(tmp_path: Path, weights: Path) -> None:
     steps = caffe_files.vgg_like(divide=64, n_stages=2)
     paths = caffe_files.write(tmp_path, steps, caffe_files.random_weights(steps), 64)
