@@ -6,7 +6,6 @@ import ipaddress
 import json
 import os
 import shutil
-import socket
 import sys
 import tempfile
 import time
@@ -25,7 +24,7 @@ from rich.markup import escape
 
 from app.commands.bench import SAMPLE
 from app.commands.console import output, print_json
-from app.commands.machine import cpu_flags, describe_cpu, memory
+from app.commands.machine import cpu_flags, describe_cpu, memory, why_no_listening
 from app.engine import chosen_networks, load_engine
 from app.errors import RequestError, StartupError
 from app.pipeline import PhotoQuery
@@ -189,21 +188,17 @@ def _disk(settings: Settings) -> Finding:
 
 def _port(settings: Settings) -> Finding:
     place = f"{settings.host}:{settings.port}"
-    try:
-        info = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM)[0]
-        with socket.socket(info[0], socket.SOCK_STREAM) as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            probe.bind(info[4])
-    except OSError as error:
-        if _answers(settings):
-            return Finding("port", "ok", f"posematch is already serving on {place}")
-        return Finding(
-            "port",
-            "failure",
-            f"{place} cannot be had: {error.strerror}",
-            "stop what uses it, or set POSEMATCH_HOST and POSEMATCH_PORT to others",
-        )
-    return Finding("port", "ok", f"{place} is free")
+    why_not = why_no_listening(settings.host, settings.port)
+    if why_not is None:
+        return Finding("port", "ok", f"{place} is free")
+    if _answers(settings):
+        return Finding("port", "ok", f"posematch is already serving on {place}")
+    return Finding(
+        "port",
+        "failure",
+        f"{place} cannot be had: {why_not}",
+        "stop what uses it, or set POSEMATCH_HOST and POSEMATCH_PORT to others",
+    )
 
 
 def _answers(settings: Settings) -> bool:

@@ -1,8 +1,11 @@
-"""What the machine is: its CPU, its memory. Linux tells most, elsewhere less is known."""
+"""What the machine is: CPU, memory, ports. Linux tells most, elsewhere less is known."""
 
 from __future__ import annotations
 
+import asyncio
+import os
 import platform
+import socket
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,6 +58,27 @@ def memory() -> Memory | None:
     if limit is not None and used is not None:
         free = min(free, limit - used)
     return Memory(free, limit)
+
+
+def why_no_listening(host: str, port: int) -> str | None:
+    """Why a server cannot listen there now; None if it can.
+
+    Binds and lets go, as asyncio's servers bind: all addresses of a name, over connections that
+    linger. Nobody can connect meanwhile, and whoever else binds at the same moment still may.
+    """
+
+    async def bind() -> None:
+        loop = asyncio.get_running_loop()
+        server = await loop.create_server(asyncio.Protocol, host, port, start_serving=False)
+        server.close()
+
+    try:
+        asyncio.run(bind())
+    except socket.gaierror as error:
+        return error.strerror or str(error)
+    except OSError as error:  # whose own text has the address once more
+        return str(error) if error.errno is None else os.strerror(error.errno)
+    return None
 
 
 def _cpuinfo(key: str) -> str:

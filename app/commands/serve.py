@@ -10,11 +10,12 @@ import uvicorn
 
 from app.api.shedding import EarlyRefusals
 from app.commands.console import build_if_missing
+from app.commands.machine import why_no_listening
 from app.connection import connection_class
 from app.errors import StartupError
 from app.main import create_app
 from app.observability import configure_logging
-from app.settings import load_settings
+from app.settings import Settings, load_settings
 
 
 def serve(
@@ -32,6 +33,9 @@ def serve(
     """  # noqa: D301
     given = {"host": host, "port": port}
     settings = load_settings(**{name: value for name, value in given.items() if value is not None})
+    why_not = why_no_listening(settings.host, settings.port)
+    if why_not is not None:  # said before a library is built, which may take minutes
+        raise _cannot_listen(settings, why_not)
     build_if_missing(settings)
     configure_logging(settings.log_level)
 
@@ -59,10 +63,14 @@ def serve(
     try:
         with suppress(KeyboardInterrupt):  # uvicorn shuts down in order, then raises it again
             server.run()
-    except SystemExit:  # its word for an address that is taken or that is none; the log says which
-        raise StartupError(
-            f"cannot listen on {settings.host} port {settings.port}; free it, or choose another "
-            "with POSEMATCH_HOST and POSEMATCH_PORT"
-        ) from None
+    except SystemExit:  # its word for an address that was taken in the meantime
+        raise _cannot_listen(settings, "see the log") from None
     if app.state.service.startup_error is not None:
         raise app.state.service.startup_error
+
+
+def _cannot_listen(settings: Settings, why: str) -> StartupError:
+    return StartupError(
+        f"cannot listen on {settings.host} port {settings.port} ({why}); free it, or choose "
+        "another with POSEMATCH_HOST and POSEMATCH_PORT"
+    )

@@ -105,12 +105,30 @@ def test_a_container_is_stopped_at_any_time(
     assert process.returncode == (0 if is_cached else 128 + signal.SIGINT)
 
 
-def test_an_address_that_is_taken(tmp_path: Path, library_dir: Path) -> None:
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0", "localhost"])
+def test_an_address_that_is_taken_is_said_before_a_library_is_built(
+    tmp_path: Path, host: str
+) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        said = refusal(tmp_path, port, library_dir=library_dir)
-    assert f"127.0.0.1 port {port}" in said
+        said = refusal(tmp_path, port, host=host)
+    assert f"cannot listen on {host} port {port} (Address already in use)" in said
     assert "POSEMATCH_PORT" in said
+    assert list(tmp_path.iterdir()) == [], "no library was begun"
+
+
+def test_an_address_that_is_none(tmp_path: Path) -> None:
+    assert "no-such-host.invalid" in refusal(tmp_path, host="no-such-host.invalid")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_restart_has_its_port_again(tmp_path: Path, library_dir: Path) -> None:
+    """Connections that the last process closed linger in the system."""
+    server = Server(tmp_path / "log", library_dir=library_dir)
+    with server, server.connect():
+        server.stop()  # which closes it from its side
+    with server:
+        assert server.is_ready()
 
 
 def test_limits_below_an_ordinary_photo(tmp_path: Path, library_dir: Path) -> None:
