@@ -24,7 +24,7 @@ from app.api.openapi import DESCRIPTION, openapi_document
 from app.api.shedding import SheddingMiddleware
 from app.engine import load_engine
 from app.errors import StartupError
-from app.observability import RequestContextMiddleware
+from app.observability import LastResortMiddleware, RequestContextMiddleware
 from app.reload import Reloader, describe
 from app.settings import Settings, load_settings
 from app.version import VERSION
@@ -101,6 +101,8 @@ def create_app(
                 expose_headers=["X-Request-ID", "Server-Timing", "Retry-After"],
             )
         )
+    # Within the former, so that pages of other origins can read what went wrong, too.
+    middleware.append(Middleware(LastResortMiddleware))
     middleware.append(Middleware(SheddingMiddleware, service=service))
     app = FastAPI(
         title="posematch",

@@ -157,9 +157,7 @@ def server_timing(timings_ms: Mapping[str, float]) -> str:
 class RequestContextMiddleware:
     """Gives each request its id, and each response its headers, metrics and log line.
 
-    The handlers leave stage timings in ``scope["state"]["timings_ms"]``. An exception nothing
-    else handled becomes a 500 that says nothing but the request id; the log has the rest. Whatever
-    the server cancels, as it does when it has waited long enough before it ends, is a 503.
+    The handlers leave stage timings in ``scope["state"]["timings_ms"]``.
     """
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
@@ -191,23 +189,49 @@ class RequestContextMiddleware:
         inner = {**scope, "method": "GET"} if scope["method"] == "HEAD" else scope
         try:
             await self._app(inner, receive, send_with_headers)
-        except asyncio.CancelledError:
-            if status:
-                raise
-            error: RequestError = NotReadyError("the service is shutting down")
-            await problem_response(error, request_id)(scope, receive, send_with_headers)
-        except Exception:
-            logger.exception("unhandled error", extra={"request_id": request_id})
-            if status:
-                raise  # the answer has begun; only closing the connection is left
-            wrong = "something went wrong here; the request id identifies it in our log"
-            error = RequestError(wrong)
-            await problem_response(error, request_id)(scope, receive, send_with_headers)
         finally:
             route = state.get("route") or getattr(inner.get("route"), "path", "unmatched")
             record_request(
                 self._metrics, scope, route, status, time.perf_counter() - started_s, request_id
             )
+
+
+class LastResortMiddleware:
+    """Answers what nothing else did.
+
+    An exception becomes a 500 that says nothing but the request id; the log has the rest. Whatever
+    the server cancels, as it does when it has waited long enough before it ends, is a 503.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one ASGI connection."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        has_begun = False
+
+        async def send_and_see(message: Message) -> None:
+            nonlocal has_begun
+            has_begun = True
+            await send(message)
+
+        request_id = scope["state"]["request_id"]
+        try:
+            await self._app(scope, receive, send_and_see)
+        except asyncio.CancelledError:
+            if has_begun:
+                raise
+            error: RequestError = NotReadyError("the service is shutting down")
+            await problem_response(error, request_id)(scope, receive, send)
+        except Exception:
+            logger.exception("unhandled error", extra={"request_id": request_id})
+            if has_begun:
+                raise  # only closing the connection is left
+            wrong = "something went wrong here; the request id identifies it in our log"
+            await problem_response(RequestError(wrong), request_id)(scope, receive, send)
 
 
 def request_id_of(scope: Scope) -> str:

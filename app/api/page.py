@@ -107,19 +107,19 @@ def page_router(directory: Path) -> APIRouter:
     page, docs = assets.pop("index.html"), assets.pop("docs.html")
     router = APIRouter(include_in_schema=False)
 
-    @router.api_route("/", methods=["GET", "HEAD"])
+    @router.get("/")
     async def get_page(request: Request) -> Response:
         response = page.respond(request)
         response.headers.update(_HEADERS)
         return response
 
-    @router.api_route("/docs", methods=["GET", "HEAD"])
+    @router.get("/docs")
     async def get_docs(request: Request) -> Response:
         response = docs.respond(request)
         response.headers.update(_HEADERS | {"Content-Security-Policy": _DOCS_POLICY})
         return response
 
-    @router.api_route("/static/{path:path}", methods=["GET", "HEAD"])
+    @router.get("/static/{path:path}")
     async def get_asset(path: str, request: Request) -> Response:
         if path not in assets:
             raise HTTPException(404)

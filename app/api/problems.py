@@ -95,7 +95,10 @@ async def _on_http_exception(request: Request, error: Exception) -> Response:
         "detail": f"{request.method} {request.url.path}: {status.description or status.phrase}",
         "request_id": request.state.request_id,
     }
-    return _response(problem, status.value, error.headers or {})
+    headers = dict(error.headers or {})
+    if headers.get("Allow") == "GET":
+        headers["Allow"] = "GET, HEAD"  # RequestContextMiddleware answers it wherever GET is
+    return _response(problem, status.value, headers)
 
 
 async def _on_client_gone(request: Request, _: Exception) -> Response:

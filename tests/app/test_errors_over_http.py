@@ -217,10 +217,14 @@ def test_unknown_and_wrong_verb(server: Server) -> None:
     problem(post(server, b"x", "/v1/poses/"), 404, "not-found")
 
 
-@pytest.mark.parametrize("path", ["/livez", "/readyz", "/v1/info", "/metrics", "/"])
+@pytest.mark.parametrize(
+    "path", ["/livez", "/v1/info", "/metrics", "/openapi.json", "/", "/docs", "/static/style.css"]
+)
 def test_what_can_be_got_can_be_asked_about(server: Server, path: str) -> None:
     response = server.client.head(path)
     assert (response.status_code, response.content) == (200, b"")
+    allowed = server.client.delete(path).headers["allow"]
+    assert set(allowed.split(", ")) == {"GET", "HEAD"}
 
 
 def test_what_would_be_ignored_is_refused(server: Server, photo: bytes) -> None:

@@ -177,10 +177,14 @@ def test_an_upload_that_outlasts_the_grace(
     tmp_path: Path, library_dir: Path, photo: bytes, grace_s: int
 ) -> None:
     """It is told so, and the log has no error of it: somebody slow is nothing out of order."""
-    settings = {"library_dir": library_dir, "shutdown_grace_s": grace_s}
+    origin = "https://example.org"
+    settings = {"library_dir": library_dir, "shutdown_grace_s": grace_s, "cors_origins": origin}
     with Server(tmp_path / "log", **settings) as server, server.connect() as connection:
-        head = b"POST /v1/poses HTTP/1.1\r\nHost: x\r\nContent-Length: %d\r\n\r\n" % len(photo)
-        connection.sendall(head + photo[:1000])
+        head = (
+            f"POST /v1/poses HTTP/1.1\r\nHost: x\r\nOrigin: {origin}\r\n"
+            f"Content-Length: {len(photo)}\r\n\r\n"
+        )
+        connection.sendall(head.encode() + photo[:1000])
         while server.metric("posematch_upload_bytes") < 1000:
             time.sleep(0.01)
         server.stop()
@@ -189,6 +193,7 @@ def test_an_upload_that_outlasts_the_grace(
     assert status == 503
     assert headers["content-type"] == "application/problem+json"
     assert headers["retry-after"] == "1"
+    assert headers["access-control-allow-origin"] == origin, "its page may read that"
     assert json.loads(body)["type"] == "urn:posematch:problem:not-ready"
     assert "Traceback" not in server.log.read_text()
 

@@ -9,8 +9,9 @@ import time
 
 import httpx
 
-from app.observability import Metrics, RequestContextMiddleware
+from app.main import create_app
 from app.schemas import InfoAnswer
+from app.settings import Settings
 from tests.app.server import Server
 
 
@@ -88,17 +89,22 @@ def test_log_lines_are_json_with_the_request_id(server: Server) -> None:
     assert (line["method"], line["path"], line["status"]) == ("GET", "/livez", 200)
 
 
-def test_an_error_of_ours_says_nothing_but_its_id() -> None:
-    async def broken(*_: object) -> None:
+def test_an_error_of_ours_says_nothing_but_its_id_to_pages_of_other_origins_too() -> None:
+    app = create_app(Settings(cors_origins="https://example.org"))
+
+    @app.get("/broken")
+    async def broken() -> None:
         raise RuntimeError("/srv/secret")
 
     async def ask() -> httpx.Response:
-        transport = httpx.ASGITransport(RequestContextMiddleware(broken, Metrics()))
+        transport = httpx.ASGITransport(app)
+        headers = {"X-Request-ID": "mine", "Origin": "https://example.org"}
         async with httpx.AsyncClient(transport=transport, base_url="http://x") as client:
-            return await client.get("/livez", headers={"X-Request-ID": "mine"})
+            return await client.get("/broken", headers=headers)
 
     response = asyncio.run(ask())
     assert response.status_code == 500
+    assert response.headers["access-control-allow-origin"] == "https://example.org"
     assert response.headers["content-type"] == "application/problem+json"
     problem = response.json()
     assert (problem["type"], problem["status"]) == ("urn:posematch:problem:internal-error", 500)
