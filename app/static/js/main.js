@@ -215,6 +215,7 @@ async function openStage() {
   } catch (error) {
     console.warn("no 3D view:", error);
     $("stage").hidden = true;
+    for (const control of [...views, ...names.map((name) => $(`show-${name}`))]) control.disabled = true;
     $("stage-notice").hidden = false;
     $("stage-notice").textContent =
       "This browser does not let the page draw in 3D (WebGL 2). The numbers below are complete.";

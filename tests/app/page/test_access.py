@@ -84,3 +84,15 @@ def test_on_a_phone(browser: Browser, server: Server) -> None:
         assert size >= 16
         # A finger on the 3D view scrolls the page; it does not trap it.
         assert page.evaluate("document.querySelector('#stage').style.touchAction") == "pan-y"
+
+
+def test_all_numbers_of_the_joints_fit_on_a_small_phone(browser: Browser, server: Server) -> None:
+    with Visit(browser, server, viewport={"width": 360, "height": 740}, is_mobile=True) as page:
+        page.click("[data-sample]")
+        answered(page)
+        width, needed = page.evaluate(
+            "(({ clientWidth, scrollWidth }) => [clientWidth, scrollWidth])"
+            "(document.querySelector('.scroll'))"
+        )
+        assert needed <= width, "± mm is not beyond the edge"
+        expect(page.locator("#joints tbody td:nth-child(4)").first).not_to_be_empty()

@@ -119,6 +119,10 @@ def test_without_webgl(playwright: Playwright, server: Server) -> None:
             page.click("[data-sample]")
             answered(page)
             expect(page.locator("#stage-notice")).to_contain_text("WebGL")
+            for name in ("View", "Shown in 3D"):
+                group = page.get_by_role("group", name=name)
+                for control in group.locator("button, input").all():
+                    expect(control).to_be_disabled()
             # Three.js says so on the console too, rightly.
             assert visit.complaints
             assert all("WebGL" in complaint for complaint in visit.complaints)
