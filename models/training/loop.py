@@ -11,6 +11,7 @@ import copy
 import json
 import math
 import queue
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -111,7 +112,7 @@ def _average_into(ema: nn.Module, model: nn.Module, decay: float) -> None:
 def _start_from(path: Path, model: nn.Module, config: dict[str, object]) -> None:
     """Load a checkpoint's averaged weights, or those of an exported ONNX file.
 
-    What begins with the model's ``ADDED`` may be missing in them. See :func:`_load`.
+    Parts that the model's ``ADDED`` describes may be missing in them. See :func:`_load`.
     """
     its_config: dict[str, object] = {}
     if path.suffix == ".onnx":
@@ -165,7 +166,7 @@ def _load(
     config: dict[str, object],
     added: str | None = None,
 ) -> None:
-    """Load a file's weights, which may lack what begins with ``added``.
+    """Load a file's weights, which may lack whole parts that the pattern ``added`` describes.
 
     ``SystemExit`` where they are of a network of another ``config``.
     """
@@ -179,12 +180,15 @@ def _load(
 def _differs(weights: dict[str, Tensor], model: nn.Module, added: str | None) -> str:
     """What weights lack, have too or have in another shape than a model's; empty if nothing."""
     own = model.state_dict()
+
+    def is_new(key: str) -> bool:
+        part = re.match(added, key) if added else None
+        return part is not None and not any(other.startswith(part[0]) for other in weights)
+
     unset = [
         key
         for key in own
-        if key not in weights
-        and not key.endswith("num_batches_tracked")
-        and not (added and key.startswith(added))
+        if key not in weights and not key.endswith("num_batches_tracked") and not is_new(key)
     ]
     if unset:
         return f"lacks {unset[:3]} ..."

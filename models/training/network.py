@@ -188,8 +188,9 @@ class ConvolutionalPoseMachine(nn.Module):
     features for sub-pixel joints.
     """
 
-    ADDED = "depth."
-    """Parameters that networks may lack which training goes on from."""
+    ADDED = r"depth\.|backbone\.c\d+\.[1-9]\d*\."
+    """Parts that networks may lack which training goes on from: depths are learned anew, and
+    further blocks of a pyramid level change nothing until they have learned something."""
 
     def __init__(self, cfg: CpmConfig) -> None:
         super().__init__()

@@ -84,7 +84,7 @@ def test_a_run_whose_loss_is_no_number_stops_and_goes_on_from_before(tmp_path: P
 def test_what_is_added_to_a_network_may_be_new_to_it(tmp_path: Path) -> None:
     old = torch.nn.ModuleDict({"a": torch.nn.Linear(2, 2)})
     new = torch.nn.ModuleDict({"a": torch.nn.Linear(2, 2), "b": torch.nn.Linear(2, 2)})
-    new.ADDED = "b."
+    new.ADDED = r"b\."
     torch.save({"ema": old.state_dict(), "config": {}, "step": 1}, tmp_path / "old.pt")
     loop._start_from(tmp_path / "old.pt", new, {})
     assert torch.equal(new["a"].weight, old["a"].weight)
@@ -94,6 +94,26 @@ def test_what_is_added_to_a_network_may_be_new_to_it(tmp_path: Path) -> None:
     torch.save({"ema": old["a"].state_dict(), "config": {}, "step": 1}, tmp_path / "other.pt")
     with pytest.raises(SystemExit, match=r"lacks .*a\.weight"):
         loop._start_from(tmp_path / "other.pt", new, {})
+
+
+def test_a_network_grows_deeper_without_a_change_of_its_answers(tmp_path: Path) -> None:
+    cfg = CpmConfig(width=8, blocks=(1, 1, 2, 1), stage_width=8, n_stages=2)
+    deeper = replace(cfg, blocks=(1, 1, 4, 2))
+    old, new = ConvolutionalPoseMachine(cfg).eval(), ConvolutionalPoseMachine(deeper).eval()
+    path = tmp_path / "last.pt"
+    torch.save({"ema": old.state_dict(), "config": cfg.as_dict(), "step": 1}, path)
+    loop._start_from(path, new, deeper.as_dict())
+    image = torch.rand(2, 3, 64, 64)
+    with torch.no_grad():
+        for stage, deeper_stage in zip(old(image), new(image), strict=True):
+            assert torch.equal(stage, deeper_stage)
+    cut = {k: v for k, v in old.state_dict().items() if not k.startswith("backbone.c16.1.b.0")}
+    torch.save({"ema": cut, "config": cfg.as_dict(), "step": 1}, path)
+    with pytest.raises(SystemExit, match=r"lacks .*backbone\.c16\.1\.b\.0\.weight"):
+        loop._start_from(path, new, deeper.as_dict())
+    torch.save({"ema": new.state_dict(), "config": deeper.as_dict(), "step": 1}, path)
+    with pytest.raises(SystemExit, match=r"has .*backbone\.c16\.2.*too"):
+        loop._start_from(path, old, cfg.as_dict())
 
 
 def test_weights_of_other_sizes_are_named_with_the_sizes_they_were_made_with(
@@ -123,7 +143,7 @@ def test_a_run_is_resumed_as_it_was_started_or_not_at_all(tmp_path: Path) -> Non
         options = f"--steps {steps} --batch 4 --threads 1 --optimizer {optimizer} --device cpu"
         args = parser.parse_args(["--data", "x", "--out", str(tmp_path), *options.split()])
         model = torch.nn.ModuleDict({"seen": torch.nn.Conv2d(3, width, 3)})
-        model.ADDED = "depth."
+        model.ADDED = r"depth\."
         if added:
             model["depth"] = torch.nn.Conv2d(3, 1, 3)
         loop.fit(
