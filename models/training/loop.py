@@ -15,7 +15,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -98,6 +98,24 @@ class Feeder:
             while True:
                 self._queue.get_nowait()
         self._thread.join()
+
+
+def _learn(
+    model: Model,
+    batch: Batch,
+    loss_of: Callable[[Model, Batch], Tensor],
+    optimizers: list[torch.optim.Optimizer],
+) -> float:
+    """One step on a batch: its loss before. Where that is no number, the weights stay."""
+    model.train()
+    loss = loss_of(model, batch)
+    value = float(loss.detach())
+    if math.isfinite(value):
+        loss.backward()  # type: ignore[no-untyped-call]
+        for o in optimizers:
+            o.step()
+            o.zero_grad(set_to_none=True)
+    return value
 
 
 def _average_into(ema: nn.Module, model: nn.Module, decay: float) -> None:
@@ -255,31 +273,24 @@ def fit(
     while progress() < 1:
         size = size_now()
         mark, mark_step = time.monotonic(), step
-        feeder = Feeder(partial(make_batch, size=size), range(step, step + args.every))
-        for batch in feeder:
-            factor = learning_rate(progress())
-            for o, rates in zip(optimizers, base_rates, strict=True):
-                for g, rate in zip(o.param_groups, rates, strict=True):
-                    g["lr"] = rate * factor
-            model.train()
-            loss = loss_of(model, tuple(t.to(args.device) for t in batch))
-            value = float(loss.detach())
-            if not math.isfinite(value):
-                feeder.close()
-                raise ModelError(
-                    f"{args.out}: the loss of step {step} is {value}: go on, from the last "
-                    "evaluation, at a lower rate of learning (--lr)"
-                )
-            loss.backward()  # type: ignore[no-untyped-call]
-            for o in optimizers:
-                o.step()
-                o.zero_grad(set_to_none=True)
-            _average_into(ema, model, min(EMA_DECAY, (1 + step) / (10 + step)))
-            running = value if math.isnan(running) else 0.98 * running + 0.02 * value
-            step += 1
-            if progress() >= 1 or size_now() != size:
-                break
-        feeder.close()
+        coming = range(step, step + args.every)
+        with closing(Feeder(partial(make_batch, size=size), coming)) as feeder:
+            for batch in feeder:
+                factor = learning_rate(progress())
+                for o, rates in zip(optimizers, base_rates, strict=True):
+                    for g, rate in zip(o.param_groups, rates, strict=True):
+                        g["lr"] = rate * factor
+                value = _learn(model, tuple(t.to(args.device) for t in batch), loss_of, optimizers)
+                if not math.isfinite(value):
+                    raise ModelError(
+                        f"{args.out}: the loss of step {step} is {value}: go on, from the last "
+                        "evaluation, at a lower rate of learning (--lr)"
+                    )
+                _average_into(ema, model, min(EMA_DECAY, (1 + step) / (10 + step)))
+                running = value if math.isnan(running) else 0.98 * running + 0.02 * value
+                step += 1
+                if progress() >= 1 or size_now() != size:
+                    break
         rate = (step - mark_step) * args.batch / (time.monotonic() - mark)
         line = {
             "step": step,
