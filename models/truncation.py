@@ -35,8 +35,8 @@ def beyond_edge(positions_px: Floats, width_px: int, height_px: int) -> NDArray[
 def whole(box: PersonBox, width_px: int, height_px: int, belief: float) -> PersonBox | None:
     """The box as the whole person would have it, if the photo's edge seems to cut them off.
 
-    It grows downwards, where photos end most often; else upwards; else, if it is wider than tall,
-    to the one side that it lies at.
+    It grows downwards, where photos end most often; else upwards; else to the one side that it
+    lies at, as of portraits that lie on their side.
 
     Args:
         box: what is seen of the person, pixels of the photo.
@@ -59,7 +59,7 @@ def whole(box: PersonBox, width_px: int, height_px: int, belief: float) -> Perso
     if bottom or top:
         height *= growth
         y = y if bottom else y + box.height_px - height
-    elif left != right and width > height:
+    elif left != right:
         width *= growth
         x = x if right else x + box.width_px - width
     else:
