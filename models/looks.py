@@ -64,13 +64,16 @@ MOST_CHANNELS = 4
 
 
 def leans(maps: Maps) -> Floats:
-    """Angle (N,) rad, clockwise as seen, by which each trunk leans, from (N, 15, h, w) maps."""
+    """Angle (N,) rad, clockwise as seen, by which each trunk leans, from (N, 15, h, w) maps.
+
+    0 where shoulders and hips are at one place: seen along the trunk.
+    """
     width = maps.shape[-1]
     trunk = maps[:, (R_SHOULDER, L_SHOULDER, R_HIP, L_HIP)]
     best = trunk.reshape(*trunk.shape[:2], -1).argmax(-1)
     cells = np.stack([best % width, best // width], -1).astype(np.float64)
     right, down = np.moveaxis(cells[:, :2].mean(1) - cells[:, 2:].mean(1), -1, 0)
-    angle: Floats = np.arctan2(right, -down)
+    angle: Floats = np.arctan2(right, 0.0 - down)  # not -down: of -0.0 the angle is half a turn
     return angle
 
 

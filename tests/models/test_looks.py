@@ -41,6 +41,12 @@ def test_the_lean_is_read_off_the_maps(angle_deg: float) -> None:
     assert abs((found - angle_deg + 180) % 360 - 180) < 5
 
 
+def test_a_trunk_that_points_at_the_camera_is_not_turned() -> None:
+    joints = leaning(0)
+    joints[[R_SHOULDER, L_SHOULDER, R_HIP, L_HIP]] = [(12, 20), (26, 20), (15, 20), (23, 20)]
+    np.testing.assert_array_equal(leans(gaussians(joints)), 0.0)
+
+
 @pytest.mark.parametrize("look", FURTHER)
 @pytest.mark.parametrize("angle_deg", [0, 30, -75, 140, 180])
 def test_further_views_are_upright(look: Look, angle_deg: float) -> None:
