@@ -65,13 +65,13 @@ def marginals(maps: NDArray[np.float32], kind: str) -> Maps:
 
 
 def without_residue(p: Maps) -> Maps:
-    """Marginals (N, J, h, w) less what is everywhere, summing to 1 again.
+    """Marginals (N, J, h, w) less what is everywhere, summing to 1 again; empty ones stay empty.
 
     A regression of beliefs leaves a hundredth or so in every cell: over the whole map more than the
     peak holds, it would make each joint's spread as wide as the crop.
     """
     kept = np.where(p < RESIDUE * p.max((-1, -2), keepdims=True), np.float32(0), p)
-    rest: Maps = kept / kept.sum((-1, -2), keepdims=True)
+    rest: Maps = kept / np.maximum(kept.sum((-1, -2), keepdims=True), np.float32(1e-12))
     return rest
 
 

@@ -98,7 +98,8 @@ def centre_view(
     Args:
         joints_px: (J, 2) pixels; rows of weight 0 may hold anything, NaN too.
         weights: (J,) in [0, 1], not all 0.
-        covariance_px2: (J, 2, 2) px² or None; carried over to first order.
+        covariance_px2: (J, 2, 2) px² or None; carried over to first order. Of rows of weight 0 it
+            may be anything and becomes 0.
         focal_length_px: focal length.
         principal_point_px: (2,).
 
@@ -123,5 +124,6 @@ def centre_view(
     covariance = None
     if covariance_px2 is not None:
         jacobian = (rotation[:2, :2] - points[:, :, None] * rotation[2, :2]) / depth[:, :, None]
-        covariance = jacobian @ covariance_px2 @ np.swapaxes(jacobian, 1, 2) / focal_length_px**2
+        given = np.where(present[:, None, None], covariance_px2, 0.0)
+        covariance = jacobian @ given @ np.swapaxes(jacobian, 1, 2) / focal_length_px**2
     return CentredView(rotation, points, covariance)

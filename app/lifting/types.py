@@ -24,7 +24,7 @@ ScaleSource = Literal["library", "request"]
 class Observation:
     """The 2D joints of one person.
 
-    ``joints_px`` (14, 2) float64; ``confidence`` (14,) in [0, 1], 0 = missing (its pixel is
+    ``joints_px`` (14, 2) float64; ``confidence`` (14,) in [0, 1], 0 = missing (all else of it is
     ignored and may be NaN); ``covariance_px2`` (14, 2, 2) px², or None when unknown: the noise is
     then estimated from the joints themselves; ``depths_px`` (14,) how much farther from the camera
     than the hip midpoint each joint is by what the picture shows of it, in pixels at the hips'

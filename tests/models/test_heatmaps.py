@@ -4,6 +4,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from models.heatmaps import (
+    Floats,
+    Maps,
     calibrated,
     marginals,
     peak_beliefs,
@@ -13,6 +15,7 @@ from models.heatmaps import (
     sub_cell_peaks,
     without_residue,
 )
+from models.rivals import shares
 
 CELLS = 40
 STRIDE = 4.0
@@ -112,6 +115,34 @@ def test_what_a_regression_leaves_everywhere_is_no_spread() -> None:
     # 2² less the blur of the targets; all that lies below the residue's level is lost.
     np.testing.assert_allclose(read.covariance[0, 0], 3 * np.eye(2), atol=1.0)
     np.testing.assert_allclose(without_residue(maps).sum((-1, -2)), 1, rtol=1e-6)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    kind=st.sampled_from(["logits", "beliefs"]),
+    scale=st.floats(-3, 3),
+    middle=st.sampled_from([-1.0, -0.01, 0.0, 0.01, 1.0]),
+    flat=st.integers(0, 14),
+    people=st.integers(1, 3),
+)
+@example(seed=0, kind="beliefs", scale=-2.0, middle=-0.01, flat=14, people=2)
+def test_whatever_the_maps_are_joints_lie_in_them_and_all_is_finite(
+    seed: int, kind: str, scale: float, middle: float, flat: int, people: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    maps = (10**scale * rng.normal(middle, 1, (people, 15, 12, 12))).astype(np.float32)
+    maps[-1, :flat] = middle  # one of them has joints of which nothing is seen
+    origin = rng.uniform(0, 60, (people, 2))
+
+    def own(p: Maps, belief: Floats) -> Maps:
+        return shares(p, belief, rng.uniform(0.5, 2, people), origin, STRIDE)
+
+    read = read_maps(maps, 14, kind, 1.0, own if people > 1 else None)
+    assert ((read.at >= -0.5) & (read.at <= 11.5)).all()
+    assert (np.linalg.eigvalsh(read.covariance) > 0).all()
+    assert ((read.peak >= 0) & (read.peak <= 1)).all()
+    assert np.isfinite(read.features).all()
 
 
 def test_marginals_sum_to_one_even_for_extreme_maps() -> None:

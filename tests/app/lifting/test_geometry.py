@@ -96,6 +96,16 @@ def test_missing_joints_do_not_move_the_view() -> None:
     np.testing.assert_array_equal(views[0].points, views[1].points)
 
 
+def test_the_covariance_of_a_missing_joint_is_not_looked_at() -> None:
+    pixels, weights = RNG.normal(size=(14, 2)) * 100 + 500, np.ones(14)
+    covariance = np.tile(4.0 * np.eye(2), (14, 1, 1))
+    weights[3], covariance[3] = 0.0, np.nan
+    view = centre_view(pixels, weights, covariance, 800.0, np.zeros(2))
+    assert view.covariance is not None
+    assert np.isfinite(view.covariance).all()
+    np.testing.assert_array_equal(view.covariance[3], 0.0)
+
+
 def test_covariance_is_carried_to_the_centred_view() -> None:
     pixels = RNG.normal(size=(14, 2)) * 80 + [900, -300]
     covariance = np.broadcast_to(np.array([[9.0, 2.0], [2.0, 4.0]]), (14, 2, 2))
