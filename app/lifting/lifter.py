@@ -218,11 +218,12 @@ class Lifter:
         wanted.lap("camera")
         warnings = (*assumed, *truncated, *self._doubts(matched, shortlist))
         answer = self._answer(matched, shortlist)
-        if not (answer.joints_mm[:, 2] > 0).all():
-            return NotLiftable("no pose in front of the camera explains the joints", warnings)
         if wanted.subject_height_mm is not None:
             answer = answer.at_height(wanted.subject_height_mm)
         candidates = self._hypotheses(shortlist, matched, person, wanted)
+        answered = (answer.joints_mm, answer.warped_mm, candidates[0].joints_mm)
+        if not all((joints_mm[:, 2] > 0).all() for joints_mm in answered):
+            return NotLiftable("no pose in front of the camera explains the joints", warnings)
         wanted.lap("warp")
         return LiftedPerson(
             exemplar=candidates[0],
@@ -413,7 +414,8 @@ def _why_not_liftable(joints_px: Floats, confidence: Floats) -> str | None:
     present = confidence > 0
     n = int(np.count_nonzero(present))
     if n < MIN_JOINTS:
-        return f"{n} joints are visible; at least {MIN_JOINTS} are needed"
+        joints = "joint is" if n == 1 else "joints are"
+        return f"{n} {joints} visible; at least {MIN_JOINTS} are needed"
     if np.count_nonzero(present[_TRUNK_JOINTS]) < MIN_TRUNK_JOINTS:
         return (
             f"fewer than {MIN_TRUNK_JOINTS} of neck, shoulders and hips are visible: "

@@ -54,6 +54,7 @@ def test_a_missing_joint_is_less_sure(lifter: Lifter, people: People) -> None:
     [
         ((0, 1, 2, 5, 8), "5 joints"),
         ((3, 4, 6, 7, 9, 10, 12, 13), "fewer than 2"),
+        ((2,), "1 joint is"),
         ((), "0 joints"),
     ],
 )
