@@ -7,15 +7,18 @@ on the scenes that training held out, against the teacher's boxes (label_scenes.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from models.card import WEIGHTS_DIR, read_card, write_card
 from models.cost import with_cost
 from models.person_detector import PersonDetector, corners, iou
 from models.session import OnnxModel
+from models.training.dataset import Image
 from models.training.scenes import LabelledScene, read_scenes
 
 SURE = 0.7
@@ -24,11 +27,16 @@ SAME, STRANGE = 0.5, 0.3
 """Overlap from which a box is the teacher's, and up to which it is none of the teacher's."""
 
 
-def recall_and_extra(detector: PersonDetector, scenes: list[LabelledScene]) -> tuple[float, float]:
-    """Share of the sure teacher boxes found; strange boxes a scene."""
+def recall_and_extra(
+    find: Callable[[Image], NDArray[np.float64]], scenes: list[LabelledScene]
+) -> tuple[float, float]:
+    """Share of the sure teacher boxes found; strange boxes a scene.
+
+    ``find`` says where people are in a picture: corner boxes (n, 4) px.
+    """
     found = wanted = extra = 0
     for scene in scenes:
-        boxes = corners(detector.detect(scene.image, 100))
+        boxes = find(scene.image)
         known = scene.people[:, :4].astype(np.float64)
         sure = known[scene.people[:, 4] >= SURE]
         found += int((iou(boxes, sure).max(0, initial=0) > SAME).sum())
@@ -49,7 +57,7 @@ def main() -> None:
 
     _, scenes = read_scenes(args.scenes, args.scenes_labels)
     detector = PersonDetector(args.name, weights_dir=args.weights)
-    recall, extra = recall_and_extra(detector, scenes)
+    recall, extra = recall_and_extra(lambda image: corners(detector.detect(image, 100)), scenes)
     path = args.weights / f"{args.name}.json"
     card = read_card(path)
     kept = {k: v for k, v in card.measured.items() if k == "training_steps"}

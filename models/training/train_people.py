@@ -6,7 +6,8 @@ Learns from mosaics of the labelled crops and from scenes that label_scenes.py h
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,17 +17,20 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from models.crop import warped
-from models.person_detector import decode, iou
+from models.errors import AnnotationError
+from models.person_detector import decode
 from models.training import loop
 from models.training.augment import worsen
 from models.training.crowds import calm_patches, crowd
 from models.training.cut_short import bust, can_be_cut, close_up, standing
 from models.training.cutout import whole
-from models.training.dataset import read_crops
+from models.training.dataset import Image, LabelledCrop, read_crops
+from models.training.measure_people import recall_and_extra
 from models.training.network import PersonConfig, PersonNetwork
 from models.training.precision import mixed_precision
 from models.training.scenes import (
     UNSURE,
+    LabelledScene,
     SceneSample,
     mosaic,
     portrait,
@@ -52,6 +56,8 @@ KINDS = {
 the photo; somebody down to its lower edge; who overlap; who are beside each other, or nobody."""
 ROUGH_SHARE = 0.3
 """Of the samples that are worsened beyond what ``expose`` does to all of them."""
+LEAST_SCORE = 0.3
+"""Of the boxes that count while training goes on; what is served has its card's threshold."""
 
 
 def targets(
@@ -102,6 +108,108 @@ def loss_from(out: Tensor, heat: Tensor, sides: Tensor, weight: Tensor, trust: T
     return (positive.sum() + negative.sum()) / n + box
 
 
+@dataclass(frozen=True)
+class Material:
+    """What samples are made of: labelled crops, and scenes that label_scenes.py has gone through.
+
+    Of the ``crops`` those that are ``whole`` and those that ``can_be_cut``; of the ``scenes`` those
+    with somebody ``standing`` and the pictures of the ``empty`` ones; ``calm`` are these and
+    patches of the others that come near nobody.
+    """
+
+    crops: list[LabelledCrop]
+    entire: list[LabelledCrop]
+    cuttable: list[LabelledCrop]
+    scenes: list[LabelledScene]
+    peopled: list[LabelledScene]
+    empty: list[Image]
+    calm: list[Image]
+
+    @classmethod
+    def of(
+        cls, crops: list[LabelledCrop], scenes: list[LabelledScene], rng: np.random.Generator
+    ) -> Material:
+        """Sorted out; ``AnnotationError`` when there is nothing for some kind of sample."""
+        empty = [s.image for s in scenes if not len(s.people) or s.people[:, 4].max() < UNSURE]
+        made = cls(
+            crops=crops,
+            entire=[crop for crop in crops if whole(crop)],
+            cuttable=[crop for crop in crops if can_be_cut(crop)],
+            scenes=scenes,
+            peopled=[scene for scene in scenes if len(standing(scene))],
+            empty=empty,
+            calm=empty + calm_patches(scenes, rng),
+        )
+        needed = {
+            "scene": made.scenes,
+            "close-up": made.peopled,
+            "portrait": made.crops,
+            "bust": made.cuttable,
+            "crowd": made.entire,
+            "mosaic": made.empty,
+        }
+        lacking = [kind for kind, those in needed.items() if not those]
+        if lacking:
+            raise AnnotationError(
+                f"crops and scenes have nothing to make samples of: {', '.join(lacking)} "
+                f"({made.counts()})"
+            )
+        return made
+
+    def counts(self) -> dict[str, int]:
+        """How much there is of each."""
+        return {name: len(those) for name, those in vars(self).items()}
+
+    def sample(self, rng: np.random.Generator, size: tuple[int, int]) -> SceneSample:
+        """A random sample of ``size`` (w, h), turned and worsened as often as the shares say."""
+        quarters = int(rng.choice(4, p=QUARTERS))
+        made = turned(self.upright(rng, size[::-1] if quarters % 2 else size), quarters)
+        return replace(made, image=worsen(made.image, rng)) if rng.random() < ROUGH_SHARE else made
+
+    def upright(self, rng: np.random.Generator, size: tuple[int, int]) -> SceneSample:
+        """A random one of the ``KINDS``."""
+        kind = rng.choice(list(KINDS), p=list(KINDS.values()))
+        if kind == "scene":
+            return scene_view(self.scenes[rng.integers(len(self.scenes))], size, rng)
+        if kind == "close-up":
+            return close_up(self.peopled[rng.integers(len(self.peopled))], size, rng)
+        if kind == "portrait":
+            return portrait(self.crops[rng.integers(len(self.crops))], size, rng)
+        if kind == "bust":
+            crop = self.cuttable[rng.integers(len(self.cuttable))]
+            return bust(crop, self.calm, size, rng)
+        if kind == "crowd":
+            return crowd(self.entire, self.calm, self.scenes, size, rng)
+        return mosaic(self.crops, self.empty, size, rng)
+
+
+def to_batch(samples: list[SceneSample], stride: int) -> loop.Batch:
+    """Images (B, 3, h, w) in [-1, 1], what ``targets`` makes of the boxes, and the trust."""
+    x = torch.from_numpy(np.stack([s.image for s in samples])).permute(0, 3, 1, 2)
+    x = x.float().mul_(1 / 127.5).sub_(1).contiguous(memory_format=torch.channels_last)
+    maps = [torch.from_numpy(a) for a in targets(samples, stride)]
+    return (x, *maps, torch.from_numpy(np.stack([s.trust for s in samples])))
+
+
+def finder(
+    model: PersonNetwork, canvas: tuple[int, int], device: str
+) -> Callable[[Image], NDArray[np.float64]]:
+    """What the network finds in a photo on a canvas (w, h): corner boxes (n, 4) in its pixels."""
+
+    def find(image: Image) -> NDArray[np.float64]:
+        h, w = image.shape[:2]
+        fit = min(canvas[0] / w, canvas[1] / h)
+        small = warped(image, np.array([[fit, 0, 0], [0, fit, 0]]), canvas)
+        x = torch.from_numpy(small).permute(2, 0, 1)[None].float() / 127.5 - 1
+        with torch.no_grad():
+            out = model(x.to(device))[0].cpu().numpy()
+        boxes, _ = decode(out, PersonNetwork.STRIDE, UNIT_PX, LEAST_SCORE)
+        found: NDArray[np.float64] = boxes / fit
+        return found
+
+    return find
+
+
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -113,55 +221,16 @@ def main() -> None:
     args = parser.parse_args()
 
     crops, _ = read_crops(args.data, args.train, "")
-    entire = [crop for crop in crops if whole(crop)]
-    cuttable = [crop for crop in crops if can_be_cut(crop)]
     train, dev = read_scenes(args.data / args.scenes, args.scenes_labels)
-    peopled = [scene for scene in train if len(standing(scene))]
-    empty = [s.image for s in train if not len(s.people) or s.people[:, 4].max() < UNSURE]
-    calm = empty + calm_patches(train, np.random.default_rng(args.seed))
-    print(
-        {
-            "crops": len(crops),
-            "whole": len(entire),
-            "to cut": len(cuttable),
-            "scenes": len(train),
-            "with people who stand": len(peopled),
-            "empty": len(empty),
-            "calm": len(calm),
-            "dev": len(dev),
-        }
-    )
+    material = Material.of(crops, train, np.random.default_rng(args.seed))
+    print(material.counts() | {"dev": len(dev)})
     width, height = (int(v) for v in args.canvas.split("x"))
-    canvas, stride = (width, height), PersonNetwork.STRIDE
-
-    def to_batch(samples: list[SceneSample]) -> loop.Batch:
-        x = torch.from_numpy(np.stack([s.image for s in samples])).permute(0, 3, 1, 2)
-        x = x.float().mul_(1 / 127.5).sub_(1).contiguous(memory_format=torch.channels_last)
-        maps = [torch.from_numpy(a) for a in targets(samples, stride)]
-        return (x, *maps, torch.from_numpy(np.stack([s.trust for s in samples])))
-
-    def upright(rng: np.random.Generator, size: tuple[int, int]) -> SceneSample:
-        kind = rng.choice(list(KINDS), p=list(KINDS.values()))
-        if kind == "scene":
-            return scene_view(train[rng.integers(len(train))], size, rng)
-        if kind == "close-up":
-            return close_up(peopled[rng.integers(len(peopled))], size, rng)
-        if kind == "portrait":
-            return portrait(crops[rng.integers(len(crops))], size, rng)
-        if kind == "bust":
-            return bust(cuttable[rng.integers(len(cuttable))], calm, size, rng)
-        if kind == "crowd":
-            return crowd(entire, calm, train, size, rng)
-        return mosaic(crops, empty, size, rng)
-
-    def sample(rng: np.random.Generator) -> SceneSample:
-        quarters = int(rng.choice(4, p=QUARTERS))
-        made = turned(upright(rng, canvas[::-1] if quarters % 2 else canvas), quarters)
-        return replace(made, image=worsen(made.image, rng)) if rng.random() < ROUGH_SHARE else made
+    canvas = (width, height)
 
     def make_batch(step: int, size: int) -> loop.Batch:  # noqa: ARG001
         rng = np.random.default_rng((args.seed, step))
-        return to_batch([sample(rng) for _ in range(args.batch)])
+        samples = [material.sample(rng, canvas) for _ in range(args.batch)]
+        return to_batch(samples, PersonNetwork.STRIDE)
 
     def loss_of(model: PersonNetwork, batch: loop.Batch) -> Tensor:
         x, heat, sides, weight, trust = batch
@@ -170,22 +239,8 @@ def main() -> None:
         return loss_from(out, heat, sides, weight, trust)
 
     def evaluate(model: PersonNetwork, _: int) -> dict[str, float]:
-        found = wanted = extra = 0
-        for scene in dev:
-            h, w = scene.image.shape[:2]
-            fit = min(width / w, height / h)
-            small = warped(scene.image, np.array([[fit, 0, 0], [0, fit, 0]]), canvas)
-            x = torch.from_numpy(small).permute(2, 0, 1)[None].float() / 127.5 - 1
-            with torch.no_grad():
-                out = model(x.to(args.device))[0].cpu().numpy()
-            boxes, _scores = decode(out, stride, UNIT_PX, 0.3)
-            sure = scene.people[scene.people[:, 4] >= 0.7]
-            ratio = iou(boxes / fit, sure[:, :4].astype(np.float64))
-            found += int((ratio.max(0, initial=0) > 0.5).sum())
-            wanted += len(sure)
-            known = iou(boxes / fit, scene.people[:, :4].astype(np.float64))
-            extra += int((known.max(1, initial=0) < 0.3).sum())
-        return {"recall": found / wanted, "unmatched_per_scene": extra / len(dev)}
+        recall, extra = recall_and_extra(finder(model, canvas, args.device), dev)
+        return {"recall": recall, "unmatched_per_scene": extra}
 
     cfg = PersonConfig()
     loop.fit(
