@@ -33,7 +33,7 @@ from onnxruntime.quantization import (
 
 from library_store.arguments import integer
 from models.card import WEIGHTS_DIR, DetectorOutput, ModelCard, PoseOutput, read_card
-from models.person_detector import PersonDetector, iou, shrunk
+from models.person_detector import PersonDetector, corners, iou, shrunk
 from models.providers import INT8_FEATURES
 from models.training.augment import canonical
 from models.training.dataset import decode_members, read_crops
@@ -248,14 +248,10 @@ def same_boxes(directory: Path, names: tuple[str, str], photos: Images) -> float
     first, second = (PersonDetector(name, weights_dir=directory) for name in names)
     both = total = 0
     for photo in photos:
-        boxes = [
-            np.array([(b.x_px, b.y_px, b.x_px + b.width_px, b.y_px + b.height_px) for b in found])
-            for found in (first.detect(photo, 100), second.detect(photo, 100))
-        ]
-        some = all(len(found) for found in boxes)
-        matched = int((iou(*boxes).max(1) > 0.5).sum()) if some else 0
+        here, there = (corners(found.detect(photo, 100)) for found in (first, second))
+        matched = int((iou(here, there).max(1, initial=0) > 0.5).sum())
         both += matched
-        total += len(boxes[0]) + len(boxes[1]) - matched
+        total += len(here) + len(there) - matched
     return both / total if total else 1.0
 
 
