@@ -97,6 +97,8 @@ class Tally:
 
     def row(self, label: str) -> str:
         """A line of the table."""
+        if not self.answered:
+            return f"| {label} | 0 | - | - | - |"
         error = f"{np.mean(self.pa_mm):.0f}" if self.pa_mm else "-"
         return (
             f"| {label} | {len(self.answered)} | {np.mean(self.answered):.1%} "

@@ -101,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add_network_option(parser)
     chosen = parser.parse_args(arguments)
     served = Served.of(chosen.library, chosen.network)
-    data = load_lifting_set(chosen.data).every(max(1, chosen.every))
+    data = load_lifting_set(chosen.data).every(chosen.every)
     levels = len(data.joints_2d_px)
     answers = {
         label: [lift(without(part, missing), served) for part in (data.half(0), data.half(1))]

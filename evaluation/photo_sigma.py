@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from app.engine import chosen_networks
+from app.errors import PoseMatchError
 from app.lifting.calibration import FUSION_SIGMA, SigmaCalibration
 from app.lifting.lifter import Lifter, LiftingSettings
 from app.lifting.types import Intrinsics, LiftedPerson, Observation
@@ -94,10 +95,12 @@ class _Raw(SigmaCalibration):
         return super().__call__(spread_mm, noise_px)
 
 
-def find_joints(renders: Path, estimator: PoseEstimator) -> Iterator[Seen]:
-    """Every person of a rendered set, found by the true box."""
+def find_joints(
+    renders: Path, estimator: PoseEstimator, people: int | None = None
+) -> Iterator[Seen]:
+    """Every person of a rendered set, or the first so many, found by the true box."""
     images = decode_members(renders)
-    for record in followed(read_annotations(renders), "joints"):
+    for record in followed(read_annotations(renders)[:people], "joints"):
         if "joints_mm" not in record:
             raise SystemExit(f"{renders} has no 3D truth: render it anew")
         joints_px = np.array(record["joints_px"])
@@ -113,7 +116,10 @@ def find_joints(renders: Path, estimator: PoseEstimator) -> Iterator[Seen]:
 
 
 def lift(people: Sequence[Seen], served: Served) -> Answers:
-    """What is answered for those who can be lifted, before any calibration."""
+    """What is answered for those who can be lifted, before any calibration.
+
+    ``PoseMatchError`` if nobody can.
+    """
     raw = _Raw((1.0,) * LSP14.n_joints, 0.0)
     lifter: Lifter = served.lifter(replace(LiftingSettings(), sigma=raw))
     rows = []
@@ -122,6 +128,8 @@ def lift(people: Sequence[Seen], served: Served) -> Answers:
         if isinstance(answer, LiftedPerson):
             error = root_centred_error_mm(answer.joints_3d_mm[None], person.joints_mm[None])[0]
             rows.append((answer.sigma_mm, error, raw.told[-1], answer.noise_px))
+    if not rows:
+        raise PoseMatchError(f"nobody can be lifted, of {len(people)} people")
     spread, error, confidence, noise = (
         np.array(column, float) for column in zip(*rows, strict=True)
     )

@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--people", type=integer(1), help="only the first so many")
     chosen = parser.parse_args(arguments)
     engine = load_engine(load_settings())
-    people = list(find_joints(chosen.renders, engine.estimator))[: chosen.people]
+    people = list(find_joints(chosen.renders, engine.estimator, chosen.people))
     records = read_annotations(chosen.renders)[: len(people)]
     truth_px = np.array([record["joints_px"] for record in records])
     found_px = np.array([person.observation.joints_px for person in people])

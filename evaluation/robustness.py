@@ -176,7 +176,7 @@ def main() -> None:
     parser.add_argument("--every", type=integer(1), default=4)
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    crops = [crop for crop in held_out_photos(args.data)[:: max(1, args.every)] if crop.has_torso]
+    crops = [crop for crop in held_out_photos(args.data)[:: args.every] if crop.has_torso]
     pipeline = load_engine(load_settings()).pipeline
     print(f"{len(crops)} held-out people\n")
     print("| photo | answered with nobody, % | found, % | PCK@0.2 of the found, % |")

@@ -43,6 +43,7 @@ def test_whom_the_photo_shows_too_little_of_is_not_asked_for(tmp_path: Path) -> 
     tally = cut_off.Tally()
     cut_off.look(None, person, person.joints_px[1, 1], tally)  # type: ignore[arg-type]
     assert not tally.answered
+    assert tally.row("the neck") == "| the neck | 0 | - | - | - |"
     assert list(person.ends.values()) == sorted(person.ends.values(), reverse=True)
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from app.errors import PoseMatchError
 from app.lifting.calibration import FUSION_SIGMA, SigmaCalibration
 from app.lifting.geometry import normalised_projection
 from app.lifting.lifter import LiftingSettings
@@ -18,6 +20,8 @@ from evaluation.networks import OFF
 from evaluation.photo_sigma import Answers, Seen, fit_doubts
 from library_store.build import BuildSettings, build_library
 from library_store.prior import PosePrior
+from models import PoseEstimator
+from models.training.dataset import read_annotations
 from tests.evaluation.rendered_set import write_set
 
 
@@ -67,6 +71,24 @@ def test_what_is_checked_is_what_is_served(tmp_path: Path) -> None:
         photo_sigma.lift(people, served).sigma_mm(FUSION_SIGMA),
         np.stack([person.sigma_mm for person in lifted if person.sigma_mm is not None]),
     )
+
+
+def test_where_nobody_can_be_lifted_it_is_said(tmp_path: Path) -> None:
+    directory = tmp_path / "tiny"
+    build_library(directory, PosePrior.load(), BuildSettings(name="tiny", n_poses=500, seed=3))
+    on_one_spot = Observation(np.zeros((14, 2)), np.ones(14))
+    nobody = Seen(on_one_spot, Intrinsics(1150.0, (0.0, 0.0), "request"), np.zeros((14, 3)))
+    with pytest.raises(PoseMatchError, match="nobody can be lifted, of 2 people"):
+        photo_sigma.lift([nobody, nobody], Served.of(directory, OFF))
+
+
+def test_only_the_joints_of_the_first_people_asked_for_are_found(tmp_path: Path) -> None:
+    assert write_set(tmp_path / "photos") > 2
+    (tmp_path / "photos" / "annotations.json").write_text(
+        json.dumps({"images": [*read_annotations(tmp_path / "photos")[:2], {}]})
+    )
+    found = photo_sigma.find_joints(tmp_path / "photos", PoseEstimator("cpm-int8"), 2)
+    assert len(list(found)) == 2
 
 
 def test_the_command_measures_photos_with_truth(
