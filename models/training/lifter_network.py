@@ -38,6 +38,7 @@ from models.errors import ModelError
 from models.training.onnx_graph import HALF, PREFIX, GraphWriter
 
 N = LSP14.n_joints
+_MIRROR = np.array(LSP14.mirror)
 LOG_RADIUS = -2.0
 """About the logarithm of a person's radius in normalised image coordinates."""
 LOG_SIZE = 5.75
@@ -219,107 +220,14 @@ def lifter_model(network: PoseMlp, moments: NDArray[np.float64]) -> onnx.ModelPr
         moments: (42, 42) second moments of the errors in units of the foretold deviations.
 
     """
-    w = GraphWriter(network)
-    mirror = np.array(LSP14.mirror)
+    w = _Writer(network)
     n_given = 5 if network.reads_depths else 3
-
-    def number(value: float) -> str:
-        return w.constant(np.array(value, np.float32))
-
-    def sum_over(value: str, *axes: int) -> str:
-        return w.node("ReduceSum", value, w.shape(*axes), keepdims=1)
-
-    def cut(value: str, begin: int, end: int, axis: int) -> str:
-        return w.node("Slice", value, w.shape(begin), w.shape(end), w.shape(axis))
-
-    def halves(value: str) -> tuple[str, str]:
-        first = w.node("Shape", "joints", start=0, end=1)
-        second = w.node("Add", first, first)
-        zero, axis = w.shape(0), w.shape(0)
-        return (
-            w.node("Slice", value, zero, first, axis),
-            w.node("Slice", value, first, second, axis),
-        )
-
-    def mean_of(value: str, order: NDArray[np.int64], signs: NDArray[np.float32]) -> str:
-        plain, mirrored = halves(value)
-        back = w.node("Gather", mirrored, w.constant(order), axis=1)
-        back = w.node("Mul", back, w.constant(signs))
-        return w.node("Mul", w.node("Add", plain, back), number(0.5))
-
-    flipped = w.node("Gather", "joints", w.constant(mirror), axis=1)
-    flipped = w.node("Mul", flipped, w.constant(np.array([-1, 1, 1, 1, 1][:n_given], np.float32)))
-    both = w.node("Concat", "joints", flipped, axis=0)
-    points, belief = cut(both, 0, 2, 2), cut(both, 2, 3, 2)
-    present = w.node("Cast", w.node("Greater", belief, number(0.0)), to=onnx.TensorProto.FLOAT)
-    shares = w.node("Div", present, sum_over(present, 1))
-    centre = sum_over(w.node("Mul", shares, points), 1)
-    centred = w.node("Mul", w.node("Sub", points, centre), present)
-    square = w.node("Mul", w.node("Mul", shares, centred), centred)
-    radius = w.node("Sqrt", w.node("Add", sum_over(square, 1, 2), number(_TINY)))
-    shape = w.node("Reshape", w.node("Div", centred, radius), w.shape(-1, 2 * N))
-    mask = w.node("Reshape", present, w.shape(-1, N))
-    doubt = w.node("Reshape", w.node("Sub", present, belief), w.shape(-1, N))
-    flat_radius = w.node("Reshape", radius, w.shape(-1, 1))
-    log_radius = w.node("Sub", w.node("Log", flat_radius), number(LOG_RADIUS))
-
-    def linear(value: str, module: nn.Linear) -> str:
-        weight, bias = w.parameter(module, "weight"), w.parameter(module, "bias")
-        return w.node("Gemm", value, weight, bias, transB=1)
-
-    def linear_in_8_bits(value: str, module: nn.Linear) -> str:
-        """Weights a byte each: reading them is what a single person costs."""
-        weight = module.weight.detach().numpy().T
-        scale = np.abs(weight).max(0) / _WEIGHT_LEVELS
-        rounded = np.round(weight / scale).astype(np.int8)
-        parts = [f"{value}_{part}" for part in ("bytes", "scale", "zero")]
-        w.nodes("DynamicQuantizeLinear", [value], parts)
-        stored = PREFIX + w.name_of(module) + ".weight"
-        weights = w.constant(rounded, stored + _BYTES)
-        product = w.node("MatMulInteger", parts[0], weights, parts[2])
-        product = w.node("Cast", product, to=onnx.TensorProto.FLOAT)
-        scales = w.constant(scale.astype(np.float32), stored + _SCALE)
-        scale_of = w.node("Mul", parts[1], scales)
-        product = w.node("Mul", product, scale_of)
-        return w.node("Add", product, w.parameter(module, "bias"))
-
-    def unit(value: str) -> str:
-        square = w.node("ReduceMean", w.node("Mul", value, value), axes=[1], keepdims=1)
-        return w.node("Div", value, w.node("Sqrt", w.node("Add", square, number(_RMS_FLOOR))))
-
-    parts = [shape, mask, log_radius, doubt]
-    if network.reads_depths:
-        known = w.node("Mul", cut(both, 4, 5, 2), present)
-        hint = w.node("Div", w.node("Mul", cut(both, 3, 4, 2), known), radius)
-        parts += [w.node("Reshape", part, w.shape(-1, N)) for part in (hint, known)]
-    features = w.node("Concat", *parts, axis=1)
-    hidden = w.node("Relu", linear(features, network.first))
-    for inner, outer in network.blocks:  # type: ignore[misc]
-        step = w.node("Relu", linear_in_8_bits(unit(hidden), inner))
-        step = linear_in_8_bits(step, outer)
-        hidden = w.node("Add", hidden, step)
-    last = linear(unit(hidden), network.last)
-
-    image = w.node("Add", shape, cut(last, _IMAGE.start, _IMAGE.stop, 1))
-    depth = cut(last, _DEPTH.start, _DEPTH.stop, 1)
-    across = cut(last, _ACROSS.start, _ACROSS.stop, 1)
-    twice = w.node("Gather", across, w.constant(np.repeat(np.arange(N), 2)), axis=1)
-    log_sigma = w.node("Concat", twice, cut(last, _ALONG.start, _ALONG.stop, 1), axis=1)
-    order = np.concatenate([(2 * mirror[:, None] + [0, 1]).ravel(), 2 * N + mirror])
-    signs = np.concatenate([np.tile([-1.0, 1.0], N), np.ones(N)]).astype(np.float32)
-    state = mean_of(w.node("Concat", image, depth, axis=1), order, signs)
-    log_sigma = mean_of(log_sigma, order, np.ones(3 * N, np.float32))
-
-    # From the root: depths about the mean of the hips' own.
-    about_root = np.eye(3 * N, dtype=np.float32)
-    about_root[2 * N + np.array([R_HIP, L_HIP]), 2 * N :] -= 0.5
-    state = w.node("MatMul", state, w.constant(about_root))
-    scale, _ = halves(flat_radius)
-    origin = w.node("Reshape", halves(centre)[0], w.shape(-1, 2))
-    origin = w.node("Gather", origin, w.constant(np.tile([0, 1], N)), axis=1)
-    origin = w.node("Pad", origin, w.shape(0, 0, 0, N))
-    state = w.node("Add", w.node("Mul", state, scale), origin)
-    sigma = w.node("Mul", w.node("Exp", log_sigma), scale)
+    sides = np.array([-1, 1, 1, 1, 1][:n_given], np.float32)
+    flipped = w.node("Gather", "joints", w.constant(_MIRROR), axis=1)
+    flipped = w.node("Mul", flipped, w.constant(sides))
+    seen = _normalised(w, w.node("Concat", "joints", flipped, axis=0))
+    last = _last_layer(w, w.node("Concat", *seen.features, axis=1))
+    state, sigma = _in_image(w, seen, last)
     columns = w.node("Reshape", sigma, w.shape(-1, 3 * N, 1))
     rows = w.node("Reshape", sigma, w.shape(-1, 1, 3 * N))
     covariance = w.node("Mul", columns, w.constant(moments.astype(np.float32)))
@@ -332,3 +240,131 @@ def lifter_model(network: PoseMlp, moments: NDArray[np.float64]) -> onnx.ModelPr
         kind=onnx.TensorProto.FLOAT,
         names=("joints", "answer"),
     )
+
+
+class _Writer(GraphWriter):
+    """A graph about people and, after them, the same people in a mirror."""
+
+    network: PoseMlp
+
+    def number(self, value: float) -> str:
+        """A constant."""
+        return self.constant(np.array(value, np.float32))
+
+    def sum_over(self, value: str, *axes: int) -> str:
+        """The sum over some axes, which stay."""
+        return self.node("ReduceSum", value, self.shape(*axes), keepdims=1)
+
+    def cut(self, value: str, part: slice, axis: int) -> str:
+        """Part of a value along one axis."""
+        begin, end = self.shape(part.start), self.shape(part.stop)
+        return self.node("Slice", value, begin, end, self.shape(axis))
+
+    def halves(self, value: str) -> tuple[str, str]:
+        """Of the people, and of them in the mirror."""
+        first = self.node("Shape", "joints", start=0, end=1)
+        second = self.node("Add", first, first)
+        zero, axis = self.shape(0), self.shape(0)
+        return (
+            self.node("Slice", value, zero, first, axis),
+            self.node("Slice", value, first, second, axis),
+        )
+
+    def mean_of(self, value: str, order: NDArray[np.int64], signs: NDArray[np.float32]) -> str:
+        """The mean of both, the mirror's columns put in ``order`` and given ``signs``."""
+        plain, mirrored = self.halves(value)
+        back = self.node("Gather", mirrored, self.constant(order), axis=1)
+        back = self.node("Mul", back, self.constant(signs))
+        return self.node("Mul", self.node("Add", plain, back), self.number(0.5))
+
+    def linear(self, value: str, module: nn.Linear) -> str:
+        """A layer."""
+        weight, bias = self.parameter(module, "weight"), self.parameter(module, "bias")
+        return self.node("Gemm", value, weight, bias, transB=1)
+
+    def linear_in_8_bits(self, value: str, module: nn.Linear) -> str:
+        """Weights a byte each: reading them is what a single person costs."""
+        weight = module.weight.detach().numpy().T
+        scale = np.abs(weight).max(0) / _WEIGHT_LEVELS
+        rounded = np.round(weight / scale).astype(np.int8)
+        parts = [f"{value}_{part}" for part in ("bytes", "scale", "zero")]
+        self.nodes("DynamicQuantizeLinear", [value], parts)
+        stored = PREFIX + self.name_of(module) + ".weight"
+        weights = self.constant(rounded, stored + _BYTES)
+        product = self.node("MatMulInteger", parts[0], weights, parts[2])
+        product = self.node("Cast", product, to=onnx.TensorProto.FLOAT)
+        scales = self.constant(scale.astype(np.float32), stored + _SCALE)
+        scale_of = self.node("Mul", parts[1], scales)
+        product = self.node("Mul", product, scale_of)
+        return self.node("Add", product, self.parameter(module, "bias"))
+
+    def unit(self, value: str) -> str:
+        """``_unit``."""
+        square = self.node("ReduceMean", self.node("Mul", value, value), axes=[1], keepdims=1)
+        floored = self.node("Add", square, self.number(_RMS_FLOOR))
+        return self.node("Div", value, self.node("Sqrt", floored))
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Names of what ``normalised`` makes: ``features``' parts, c (2n, 1, 2) and r (2n, 1)."""
+
+    features: tuple[str, ...]
+    centre: str
+    radius: str
+
+
+def _normalised(w: _Writer, both: str) -> _Seen:
+    """``normalised``, of joints (2n, 14, 3 or 5)."""
+    points, belief = w.cut(both, slice(0, 2), 2), w.cut(both, slice(2, 3), 2)
+    present = w.node("Cast", w.node("Greater", belief, w.number(0.0)), to=onnx.TensorProto.FLOAT)
+    shares = w.node("Div", present, w.sum_over(present, 1))
+    centre = w.sum_over(w.node("Mul", shares, points), 1)
+    centred = w.node("Mul", w.node("Sub", points, centre), present)
+    square = w.node("Mul", w.node("Mul", shares, centred), centred)
+    radius = w.node("Sqrt", w.node("Add", w.sum_over(square, 1, 2), w.number(_TINY)))
+    shape = w.node("Reshape", w.node("Div", centred, radius), w.shape(-1, 2 * N))
+    mask = w.node("Reshape", present, w.shape(-1, N))
+    doubt = w.node("Reshape", w.node("Sub", present, belief), w.shape(-1, N))
+    flat_radius = w.node("Reshape", radius, w.shape(-1, 1))
+    log_radius = w.node("Sub", w.node("Log", flat_radius), w.number(LOG_RADIUS))
+    parts = [shape, mask, log_radius, doubt]
+    if w.network.reads_depths:
+        known = w.node("Mul", w.cut(both, slice(4, 5), 2), present)
+        hint = w.node("Div", w.node("Mul", w.cut(both, slice(3, 4), 2), known), radius)
+        parts += [w.node("Reshape", part, w.shape(-1, N)) for part in (hint, known)]
+    return _Seen(tuple(parts), centre, flat_radius)
+
+
+def _last_layer(w: _Writer, features: str) -> str:
+    """``PoseMlp.forward``, its blocks in 8 bits."""
+    hidden = w.node("Relu", w.linear(features, w.network.first))
+    for inner, outer in w.network.blocks:  # type: ignore[misc]
+        step = w.node("Relu", w.linear_in_8_bits(w.unit(hidden), inner))
+        step = w.linear_in_8_bits(step, outer)
+        hidden = w.node("Add", hidden, step)
+    return w.linear(w.unit(hidden), w.network.last)
+
+
+def _in_image(w: _Writer, seen: _Seen, last: str) -> tuple[str, str]:
+    """States (n, 42) in normalised image coordinates and relative depths, and their deviations."""
+    image = w.node("Add", seen.features[0], w.cut(last, _IMAGE, 1))
+    depth = w.cut(last, _DEPTH, 1)
+    across = w.cut(last, _ACROSS, 1)
+    twice = w.node("Gather", across, w.constant(np.repeat(np.arange(N), 2)), axis=1)
+    log_sigma = w.node("Concat", twice, w.cut(last, _ALONG, 1), axis=1)
+    order = np.concatenate([(2 * _MIRROR[:, None] + [0, 1]).ravel(), 2 * N + _MIRROR])
+    signs = np.concatenate([np.tile([-1.0, 1.0], N), np.ones(N)]).astype(np.float32)
+    state = w.mean_of(w.node("Concat", image, depth, axis=1), order, signs)
+    log_sigma = w.mean_of(log_sigma, order, np.ones(3 * N, np.float32))
+
+    # From the root: depths about the mean of the hips' own.
+    about_root = np.eye(3 * N, dtype=np.float32)
+    about_root[2 * N + np.array([R_HIP, L_HIP]), 2 * N :] -= 0.5
+    state = w.node("MatMul", state, w.constant(about_root))
+    scale, _ = w.halves(seen.radius)
+    origin = w.node("Reshape", w.halves(seen.centre)[0], w.shape(-1, 2))
+    origin = w.node("Gather", origin, w.constant(np.tile([0, 1], N)), axis=1)
+    origin = w.node("Pad", origin, w.shape(0, 0, 0, N))
+    state = w.node("Add", w.node("Mul", state, scale), origin)
+    return state, w.node("Mul", w.node("Exp", log_sigma), scale)
