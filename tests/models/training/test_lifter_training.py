@@ -16,7 +16,7 @@ from torch import Tensor  # noqa: E402
 
 from library_store.prior import PosePrior  # noqa: E402
 from library_store.skeleton import LSP14  # noqa: E402
-from library_store.upright import MOST_LEAN, lean_rad  # noqa: E402
+from library_store.upright import MOST_LEAN, MOST_LEAN_OF_HALF, lean_rad  # noqa: E402
 from models import ModelError, PoseLifter  # noqa: E402
 from models.card import WEIGHTS_DIR, LiftOutput, read_card  # noqa: E402
 from models.training import lifter_samples, train_lifter  # noqa: E402
@@ -127,15 +127,16 @@ def test_edges_leave_the_joints_on_one_side_of_a_line(
     outer = np.where(there, np.inf, along).min(1)
     apart = inner <= outer + 1e-4
     assert apart.any(1).mean() > 0.99
-    # Mostly it is the lower edge: y points down.
-    assert (apart[:, np.cos(directions) > np.cos(0.6)].any(1)).mean() > 0.75
+    # Mostly it is the lower edge (y points down), though not of who lies: it is turned with them.
+    assert (apart[:, np.cos(directions) > np.cos(0.6)].any(1)).mean() > 0.7
 
 
 def test_nobody_leans_farther_than_the_service_lets_them(poses: Floats) -> None:
     lying = poses @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], np.float32)
     samples = draw(np.concatenate([poses, lying]), 500, np.random.default_rng(0))
     lean = np.abs(lean_rad(samples.points, samples.present > 0))
-    assert lean.max() < MOST_LEAN + 1e-4
+    assert lean.max() < MOST_LEAN_OF_HALF + 1e-4
+    assert lean[samples.present.all(1)].max() < MOST_LEAN + 1e-4
     assert 0.2 < (lean < 1e-4).mean() < 0.8
     upright = samples.truth[:, 1, 1] < samples.truth[:, [8, 11], 1].mean(1)
     assert upright.mean() > 0.95, "the truth is turned with what is seen"
