@@ -24,6 +24,7 @@ from models.training.augment import CROP_SCALE
 from models.training.loop import read_checkpoint
 from models.training.network import (
     BACKGROUND,
+    COARSEST_STRIDE_PX,
     ConvolutionalPoseMachine,
     CpmConfig,
     PersonConfig,
@@ -34,8 +35,6 @@ from models.training.onnx_graph import HALF, PREFIX, person_model, pose_model
 from models.training.train_people import UNIT_PX
 
 Kind = Literal["cpm", "person"]
-COARSEST_STRIDE_PX = 32
-"""Of both networks' pyramids."""
 DETECTOR_THRESHOLD = 0.35
 PHOTO_PX = 320
 """Default for the longer side of the photo that the person network sees."""

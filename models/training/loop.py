@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -26,6 +27,7 @@ from torch import Tensor, nn
 from library_store.arguments import SEED, integer, real
 from models.errors import ModelError
 from models.training import optimizer as optim
+from models.training.network import COARSEST_STRIDE_PX
 
 Model = TypeVar("Model", bound=nn.Module)
 Batch = tuple[Tensor, ...]
@@ -53,9 +55,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def parse_sizes(text: str) -> list[tuple[float, int]]:
-    """``96:0.4,128:1`` -> [(0.4, 96), (1.0, 128)]: input size up to that share of the run."""
-    pairs = [part.split(":") for part in text.split(",")]
-    return [(float(until), int(size)) for size, until in pairs]
+    """``96:0.4,128:1`` -> [(0.4, 96), (1.0, 128)]: input size up to that share of the run.
+
+    For ``add_argument(type=...)``. Shares ascend; the last size is that of the rest of the run.
+    """
+    try:
+        pairs = [part.split(":") for part in text.split(",")]
+        sizes = [(float(until), int(size)) for size, until in pairs]
+    except ValueError:
+        sizes = []
+    shares = [0.0, *(until for until, _ in sizes)]
+    ascend = all(before < after <= 1.0 for before, after in pairwise(shares))
+    if not sizes or not ascend or any(size < 1 or size % COARSEST_STRIDE_PX for _, size in sizes):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not like 96:0.3,128:1, multiples of {COARSEST_STRIDE_PX} px up to "
+            "ascending shares of the run"
+        )
+    return sizes
 
 
 def learning_rate(progress: float) -> float:

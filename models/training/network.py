@@ -15,6 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 BACKGROUND = 1
+COARSEST_STRIDE_PX = 32
+"""Of both networks' pyramids: sizes of images are multiples of it."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from library_store.arguments import integer
+from library_store.arguments import integer, integers
 from models.pck import correct_keypoints
 from models.training import loop
 from models.training.augment import Sample, canonical, random_view
@@ -95,10 +95,13 @@ def main() -> None:
     parser.add_argument("--train", default="lspet_train_a,lspet_train_b,photos_a,photos_b")
     parser.add_argument("--test", default="lspet_val")
     parser.add_argument(
-        "--sizes", default="96:0.3,128:0.7,160:1", help="input px:up to share of run"
+        "--sizes",
+        type=loop.parse_sizes,
+        default="96:0.3,128:0.7,160:1",
+        help="input px:up to share of run",
     )
     parser.add_argument("--width", type=integer(1), default=32)
-    parser.add_argument("--blocks", default="2,3,4,3")
+    parser.add_argument("--blocks", type=integers(4, ","), default="2,3,4,3")
     parser.add_argument("--stage-width", type=integer(1), default=64)
     parser.add_argument("--stages", type=integer(1), default=3)
     parser.add_argument("--depths", type=Path, help="learn depths too; what depth_teacher wrote")
@@ -110,7 +113,7 @@ def main() -> None:
     torch.manual_seed(args.seed)
     crops, kept = read_crops(args.data, args.train, args.test, args.depths)
     print({"train": len(crops)} | {k: len(v) for k, v in kept.items()}, flush=True)
-    n4, n8, n16, n32 = (int(b) for b in args.blocks.split(","))
+    n4, n8, n16, n32 = args.blocks
     cfg = CpmConfig(
         width=args.width,
         blocks=(n4, n8, n16, n32),
@@ -154,7 +157,7 @@ def main() -> None:
     loop.fit(
         ConvolutionalPoseMachine(cfg),
         args,
-        sizes=loop.parse_sizes(args.sizes),
+        sizes=args.sizes,
         make_batch=make_batch,
         loss_of=loss_of,
         evaluate=evaluate,

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
+from library_store.arguments import integers
 from models.crop import warped
 from models.errors import AnnotationError
 from models.person_detector import decode
@@ -26,7 +27,7 @@ from models.training.cut_short import bust, can_be_cut, close_up, standing
 from models.training.cutout import whole
 from models.training.dataset import Image, LabelledCrop, read_crops
 from models.training.measure_people import recall_and_extra
-from models.training.network import PersonConfig, PersonNetwork
+from models.training.network import COARSEST_STRIDE_PX, PersonConfig, PersonNetwork
 from models.training.precision import mixed_precision
 from models.training.scenes import (
     UNSURE,
@@ -217,14 +218,19 @@ def main() -> None:
     parser.add_argument("--train", default="lspet_train_a,lspet_train_b,photos_a,photos_b")
     parser.add_argument("--scenes", default="photos_scenes.tar")
     parser.add_argument("--scenes-labels", type=Path, required=True)
-    parser.add_argument("--canvas", default="320x256", help="training size, width x height")
+    parser.add_argument(
+        "--canvas",
+        type=integers(2, "x", multiples_of=COARSEST_STRIDE_PX),
+        default="320x256",
+        help="training size in px, width x height",
+    )
     args = parser.parse_args()
 
     crops, _ = read_crops(args.data, args.train, "")
     train, dev = read_scenes(args.data / args.scenes, args.scenes_labels)
     material = Material.of(crops, train, np.random.default_rng(args.seed))
     print(material.counts() | {"dev": len(dev)})
-    width, height = (int(v) for v in args.canvas.split("x"))
+    width, height = args.canvas
     canvas = (width, height)
 
     def make_batch(step: int, size: int) -> loop.Batch:  # noqa: ARG001

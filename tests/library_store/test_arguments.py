@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from evaluation.paper.__main__ import main
-from library_store.arguments import SEED, integer, real
+from library_store.arguments import SEED, integer, integers, real
 
 ROOT = Path(__file__).parents[2]
 PROGRAMS = ("app", "benchmarks", "deploy", "evaluation", "library_store", "models", "client")
@@ -23,13 +23,16 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--minutes", type=real(0.1))
     parser.add_argument("--share", type=real(0, 1))
     parser.add_argument("--seed", type=SEED)
+    parser.add_argument("--blocks", type=integers(4, ","))
+    parser.add_argument("--canvas", type=integers(2, "x", multiples_of=32))
     return parser
 
 
 def test_bounds_are_included(parser: argparse.ArgumentParser) -> None:
     line = "--count 1 70 --jobs 4 --minutes 0.1 --share 1 --seed 9223372036854775807"
-    found = vars(parser.parse_args(line.split()))
+    found = vars(parser.parse_args([*line.split(), "--blocks", "2,3,4,1", "--canvas", "320x32"]))
     wanted = {"count": [1, 70], "jobs": 4, "minutes": 0.1, "share": 1.0, "seed": 2**63 - 1}
+    wanted |= {"blocks": [2, 3, 4, 1], "canvas": [320, 32]}
     assert found == wanted
     assert isinstance(found["share"], float)
 
@@ -47,6 +50,11 @@ def test_bounds_are_included(parser: argparse.ArgumentParser) -> None:
         ("--share 1.01", "argument --share: '1.01' is no number from 0 to 1"),
         ("--share half", "argument --share: 'half' is no number from 0 to 1"),
         ("--seed 9223372036854775808", "is no integer from 0 to 9223372036854775807"),
+        ("--blocks 2,3,4", "'2,3,4' is not 4 integers above 0 with ',' between them"),
+        ("--blocks 2,0,4,3", "'2,0,4,3' is not 4 integers above 0 with ',' between them"),
+        ("--blocks 2,,4,3", "'2,,4,3' is not 4 integers above 0 with ',' between them"),
+        ("--canvas 320x250", "'320x250' is not 2 multiples of 32 above 0 with 'x' between them"),
+        ("--canvas 320", "'320' is not 2 multiples of 32 above 0 with 'x' between them"),
     ],
 )
 def test_what_is_out_of_range_is_refused_in_one_line(

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -15,7 +17,7 @@ torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
 from models.errors import ModelError  # noqa: E402
-from models.training import loop  # noqa: E402
+from models.training import loop, train, train_people  # noqa: E402
 from models.training.network import ConvolutionalPoseMachine, CpmConfig  # noqa: E402
 from models.training.onnx_graph import pose_model  # noqa: E402
 
@@ -194,3 +196,32 @@ def test_what_only_averages_is_a_start_and_no_run_to_resume(tmp_path: Path) -> N
         run(tmp_path)
     run(tmp_path / "anew", "--init", str(tmp_path / "last.pt"))
     assert loop.read_checkpoint(tmp_path / "anew" / "last.pt")["step"] == 1
+
+
+def test_sizes_are_multiples_of_the_coarsest_stride_up_to_ascending_shares() -> None:
+    assert loop.parse_sizes("96:0.3,128:1") == [(0.3, 96), (1.0, 128)]
+    for wrong in ("", "96", "96:", "100:1", "0:1", "96:x", "96:nan", "96:0", "96:2", "96:1,64:0.5"):
+        with pytest.raises(argparse.ArgumentTypeError, match=f"'{wrong}' is not like 96:0.3,128:1"):
+            loop.parse_sizes(wrong)
+
+
+@pytest.mark.parametrize(
+    ("program", "option"),
+    [
+        (train, "--sizes 100:1"),
+        (train, "--blocks 2,3"),
+        (train_people, "--scenes-labels x --canvas 10x10"),
+    ],
+)
+def test_programs_refuse_other_sizes_in_one_line(
+    program: ModuleType,
+    option: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["", "--data", "x", "--out", "x", *option.split()])
+    with pytest.raises(SystemExit) as refused:
+        program.main()
+    assert refused.value.code == 2
+    *_, name, value = option.split()
+    assert f"error: argument {name}: '{value}' is not " in capsys.readouterr().err.splitlines()[-1]
