@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from library_store.anatomy import Float
 from library_store.errors import LibraryError
+from library_store.importers.clip import counted
 from library_store.limits import Limits, learn_limits
 from library_store.mocap import MocapSettings, Pool
 from library_store.prior import PosePrior
@@ -180,8 +181,8 @@ class Composed:
                 )
             except ValueError as error:
                 raise LibraryError(
-                    f"these {len(kept)} poses cannot be recombined: {error}. Build from more and "
-                    "other poses, or with --recombined 0"
+                    f"{counted(len(kept), 'pose')} cannot be recombined: {error}. Build from more "
+                    "and other poses, or with --recombined 0"
                 ) from error
             n = rows.stop - rows.start
             parts = np.concatenate([places[drawn.rows], drawn.mirrored[..., None]], axis=-1)

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from library_store.importers.checks import checked, unit_that_fits
-from library_store.importers.clip import Clip, Float, Frames, MocapError
+from library_store.importers.clip import Clip, Float, Frames, MocapError, counted
 from library_store.importers.rotation import euler
 from library_store.skeleton import HEAD_TOP
 
@@ -273,7 +273,7 @@ def read_amc(path: Path, asf: SkeletonFile) -> tuple[Frames, dict[str, Float]]:
             elif words[0] not in widths:
                 raise ValueError("its skeleton has no such bone, or none that turns")
             elif len(words) - 1 != widths[words[0]] or not frames:
-                raise ValueError(f"{widths[words[0]]} values expected")
+                raise ValueError(f"{counted(widths[words[0]], 'value')} expected")
             else:
                 values[words[0]].append([float(word) for word in words[1:]])
                 if len(values[words[0]]) != len(frames):

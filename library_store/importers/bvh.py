@@ -24,7 +24,7 @@ import numpy as np
 
 from library_store.importers.asf_amc import CMU_LICENCE, describe_cmu
 from library_store.importers.checks import checked_or_error, unit_that_fits
-from library_store.importers.clip import Clip, Float, MocapError
+from library_store.importers.clip import Clip, Float, MocapError, counted
 from library_store.importers.head import HEAD_PER_TRUNK, put_head_top
 from library_store.importers.joint_tables import (
     JointMapping,
@@ -151,7 +151,9 @@ def parse(path: Path) -> BvhFile:
     width = sum(len(joint.channels) for joint in joints)
     if n_frames < 1 or values.size != n_frames * width:
         raise MocapError(
-            path, f"{n_frames} frames of {width} channels expected, {values.size} values found"
+            path,
+            f"{counted(n_frames, 'frame')} of {width} channels expected, "
+            f"{counted(values.size, 'value')} found",
         )
     if not 0.0 <= frame_time_s < math.inf:
         raise MocapError(path, f"a frame time of {frame_time_s:g} s is none")
