@@ -293,7 +293,9 @@ def _describe(settings: MocapSettings, n_captured: int, n_composed: int) -> dict
 def _spread(n_exemplars: int, cameras_per_pose: int) -> NDArray[np.int64]:
     """How many cameras see each pose, the last one maybe fewer than the others."""
     whole, rest = divmod(n_exemplars, cameras_per_pose)
-    return np.array([cameras_per_pose] * whole + [rest] * (rest > 0), dtype=np.int64)
+    counts = np.full(whole + (rest > 0), cameras_per_pose, dtype=np.int64)
+    counts[whole:] = rest
+    return counts
 
 
 def _composition(mocap: Mocap, seed: int) -> str:

@@ -7,6 +7,7 @@ and which of them thinning keeps.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -52,7 +53,8 @@ class MocapSettings:
     credit: str = ""
 
     def __post_init__(self) -> None:
-        if not (self.rate_hz > 0 and self.radius_mm >= 0 and 0 <= self.recombined <= 1):
+        finite = 0 < self.rate_hz < math.inf and 0 <= self.radius_mm < math.inf
+        if not (finite and 0 <= self.recombined <= 1):
             raise ValueError("rate, radius and share of recombined poses must make sense")
         if not (0 <= self.limit_quantile < 0.5 and self.stature_sd >= 0 and self.bone_sd >= 0):
             raise ValueError("spreads and the limits' quantile must make sense")

@@ -38,6 +38,10 @@ from library_store.sources import Kind
 commands = typer.Typer(help="The exemplar library.", no_args_is_help=True)
 
 DEFAULT_SIZE = 200_000
+MAX_SIZE = 2**31 - 1
+"""Poses and cameras are numbered in four bytes."""
+MAX_RATE_HZ = 10_000
+"""No camera is so fast: all poses are taken. Of an infinite rate a manifest would be no JSON."""
 
 LibraryArgument = Annotated[
     Path | None,
@@ -73,7 +77,12 @@ def build(
         typer.Option(help="default, none or a file: sample from a prior; none with --from."),
     ] = None,
     size: Annotated[
-        int, typer.Option(min=1, help="How many exemplars; of several cameras a pose, whole poses.")
+        int,
+        typer.Option(
+            min=1,
+            max=MAX_SIZE,
+            help="How many exemplars; of several cameras a pose, whole poses.",
+        ),
     ] = DEFAULT_SIZE,
     prior_share: Annotated[
         float, typer.Option(min=0, max=1, help="Share sampled where a prior joins --from.")
@@ -82,10 +91,13 @@ def build(
         int, typer.Option(min=1, help="Cameras of each sampled or recombined pose.")
     ] = 1,
     rate: Annotated[
-        float, typer.Option(min=0.1, help="Every n-th pose, as few as still give so many a second.")
+        float,
+        typer.Option(
+            min=0.1, max=MAX_RATE_HZ, help="Every n-th pose, as few as still give so many a second."
+        ),
     ] = 30,
     radius_mm: Annotated[
-        float, typer.Option(min=0, help="Of poses nearer than this one is kept.")
+        float, typer.Option(min=0, max=1_000, help="Of poses nearer than this one is kept.")
     ] = 30,
     mirror: Annotated[bool, typer.Option(help="Add mirror images.")] = True,
     recombined: Annotated[
@@ -341,7 +353,10 @@ def import_mocap(
             help="JSON or TOML: lsp14 joint to BVH joint or C3D marker, or a list of them.",
         ),
     ] = None,
-    fps: Annotated[float, typer.Option(min=0.1, help="Keep at least so many poses a second.")] = 30,
+    fps: Annotated[
+        float,
+        typer.Option(min=0.1, max=MAX_RATE_HZ, help="Keep at least so many poses a second."),
+    ] = 30,
     licence: Annotated[str, typer.Option(help="Of clips that state none.")] = "",
     strict: Annotated[bool, typer.Option(help="Refuse all if one file cannot be read.")] = False,
 ) -> None:

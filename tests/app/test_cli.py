@@ -302,6 +302,20 @@ def test_a_library_in_service_is_not_replaced_unasked(tmp_path: Path) -> None:
     assert json.loads(run("library", "info", own, "--json").stdout)["n_exemplars"] == 70
 
 
+@pytest.mark.parametrize("option", ["--rate", "--radius-mm", "--fps", "--size"])
+@pytest.mark.parametrize("value", ["inf", "nan", "1e300", "-1", "1000000000000"])
+def test_numbers_that_make_no_sense_are_refused(option: str, value: str, tmp_path: Path) -> None:
+    file = tmp_path / "a.npz"
+    write_clips(file, clip("dance", 120, 1, licence="ours"))
+    if option == "--fps":
+        refused = invoke("library", "import", file, "--out", tmp_path / "out.npz", option, value)
+    else:
+        build = ("library", "build", "--from", file, "--directory", tmp_path / "own")
+        refused = invoke(*build, option, value)
+    assert (refused.exit_code, option in refused.stderr) == (2, True)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.npz"]
+
+
 def test_a_library_of_ones_own(tmp_path: Path) -> None:
     """Build, look, merge: what the documentation shows."""
     files = {name: tmp_path / f"{name}.npz" for name in "ab"}
