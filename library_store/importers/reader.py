@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -43,6 +44,14 @@ def _read_file(path: Path, mapping: Path | None) -> Sequence[Clip | MocapError]:
         ".npz": lambda: npz.read(path),
     }
     importer = importers.get(path.suffix.lower())
+    try:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            os.scandir(path).close()  # says why it cannot be read, if so
+        if not stat.S_ISREG(mode):
+            raise MocapError(path, "is no file")  # a pipe would be waited for
+    except OSError as error:
+        raise MocapError(path, f"cannot be read: {error.strerror}") from error
     if importer is None:
         problem = f"not a kind of file that can be imported: {', '.join(SUFFIXES)}"
         packed = path.suffix.lower() in _ARCHIVES
@@ -58,28 +67,29 @@ def _read_file(path: Path, mapping: Path | None) -> Sequence[Clip | MocapError]:
 def find_files(paths: Iterable[Path]) -> Iterator[Path]:
     """The files given, and those below the folders given that an importer would take, in order.
 
+    Among them are folders that cannot be read, for ``read`` to say so: what is in them is missing.
     Links to folders are followed, to each folder once. What macOS keeps beside files on foreign
     disks and in archives (``._walk.bvh``) is no file of a folder.
     """
     for path in paths:
         if path.is_dir():
-            yield from sorted(
-                p
-                for p in _below(path)
-                if p.suffix.lower() in SUFFIXES and not p.name.startswith("._")
-            )
+            yield from sorted(_below(path))
         else:
             yield path
 
 
 def _below(folder: Path) -> Iterator[Path]:
     entered: set[str] = set()
-    for place, folders, files in os.walk(folder, followlinks=True):
+    closed: list[OSError] = []
+    for place, folders, files in os.walk(folder, onerror=closed.append, followlinks=True):
         if os.path.realpath(place) in entered:
             folders.clear()
             continue
         entered.add(os.path.realpath(place))
-        yield from (Path(place, file) for file in files)
+        for file in files:
+            if Path(file).suffix.lower() in SUFFIXES and not file.startswith("._"):
+                yield Path(place, file)
+    yield from (Path(error.filename) for error in closed)
 
 
 def read_each(

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,7 @@ def test_files_of_other_kinds_and_missing_ones(folder: Path) -> None:
 
 
 def test_an_archive_is_to_be_unpacked(tmp_path: Path) -> None:
+    (tmp_path / "clips.zip").write_bytes(b"PK")
     with pytest.raises(MocapError, match=r"clips\.zip: not a kind of file .*; unpack it first"):
         read(tmp_path / "clips.zip")
 
@@ -69,6 +71,28 @@ def test_links_to_folders_are_followed_and_rings_end(folder: Path, tmp_path: Pat
     (top / "walk.bvh" / "ring").symlink_to(top)
     names = [path.relative_to(top).as_posix() for path in find_files([top])]
     assert names == ["linked/02_01.amc", "linked/02_02.amc", "walk.bvh/inner.bvh"]
+
+
+def test_folders_that_cannot_be_read_are_named(folder: Path) -> None:
+    name, depth = "x" * 200, 25
+    opened = [os.open(folder, os.O_RDONLY)]
+    for _ in range(depth):  # longer than any path may be: root may read everything else
+        os.mkdir(name, dir_fd=opened[-1])
+        opened.append(os.open(name, os.O_RDONLY, dir_fd=opened[-1]))
+    clips, skipped = read_all([folder])
+    assert len(clips) == 2
+    assert len(skipped) == 2
+    assert str(skipped[1]).endswith(f"{name}: cannot be read: File name too long")
+    with pytest.raises(MocapError, match="is no file"):
+        read(folder / "02")
+    for number in opened:
+        os.close(number)
+
+
+def test_a_pipe_is_not_waited_for(folder: Path) -> None:
+    os.mkfifo(folder / "pipe.bvh")
+    _, skipped = read_all([folder])
+    assert str(skipped[1]) == f"{folder / 'pipe.bvh'}: is no file"
 
 
 @pytest.mark.parametrize(
