@@ -75,8 +75,8 @@ class NpzFile:
             raise MocapError(self._path, f"array {name!r} cannot be read: {error}") from error
 
     def column(self, name: str) -> list[str]:
-        """A one-dimensional array as strings; empty where there is none."""
-        values = self[name] if name in self.names else np.array([])
+        """A one-dimensional array, or a single value, as strings; empty where there is none."""
+        values = np.atleast_1d(self[name]) if name in self.names else np.array([])
         if values.ndim != 1:
             raise MocapError(self._path, f"array {name!r} must have one dimension")
         return [_string(value) for value in values]

@@ -188,6 +188,12 @@ def test_what_cannot_be_written_is_named(tmp_path: Path, poses: Float) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_single_clip_may_be_described_by_single_values(tmp_path: Path, poses: Float) -> None:
+    np.savez(tmp_path / "a.npz", positions=poses, clip_name="walk", clip_fps=100)
+    (clip,) = read(tmp_path / "a.npz")
+    assert (clip.name, clip.frame_rate_hz) == ("walk", 100.0)
+
+
 def test_generic_files_in_another_joint_order(tmp_path: Path, poses: Float) -> None:
     path = tmp_path / "other.npz"
     order = np.random.default_rng(0).permutation(14)
@@ -212,7 +218,7 @@ def test_generic_files_in_another_joint_order(tmp_path: Path, poses: Float) -> N
         ({"positions": np.ones((4, 14, 3)), "frame": np.arange(4) - 1}, "no frame numbers"),
         ({"positions": np.ones((4, 14, 3)), "frame": np.arange(4) + 2**31}, "no frame numbers"),
         ({"positions": np.ones((4, 14, 3)), "clip_fps": np.array(["fast"])}, "clip_fps 'fast'"),
-        ({"positions": np.ones((4, 14, 3)), "clip_name": np.array("a")}, "one dimension"),
+        ({"positions": np.ones((4, 14, 3)), "clip_name": np.array([["a"]])}, "one dimension"),
         (
             {
                 "positions": np.ones((2, 14, 3)),
