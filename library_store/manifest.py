@@ -217,7 +217,9 @@ def check_files(
         except FileNotFoundError:
             raise LibraryError(f"{path} is missing; {mend}") from None
         except OSError as error:
-            raise LibraryError(f"{path} cannot be read ({error}); {mend}") from error
+            raise LibraryError(
+                f"{path} cannot be read ({error.strerror}): may this user read it?"
+            ) from error
 
     # Summing runs without Python's lock, and is most of opening a large library.
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:

@@ -432,3 +432,12 @@ def test_a_manifest_with_a_number_that_is_none_is_that_of_one_library(tiny: Path
 def test_no_library_at_all(tmp_path: Path) -> None:
     with pytest.raises(LibraryError, match=r"no pose library in .*posematch library build"):
         load(tmp_path / "nowhere")
+
+
+def test_files_that_may_not_be_read_are_not_to_be_deleted(tiny: Path) -> None:
+    """A ring of links stands for what a user's rights, or a share that is away, refuse."""
+    (tiny / "poses.npy").unlink()
+    (tiny / "poses.npy").symlink_to("poses.npy")
+    with pytest.raises(LibraryError, match=r"poses\.npy cannot be read \(Too many levels") as error:
+        verify_library(tiny)
+    assert "delete" not in str(error.value)
