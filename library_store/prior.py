@@ -163,7 +163,7 @@ class PosePrior:
             )
         except (OSError, ValueError, KeyError, TypeError, EOFError, BadZipFile) as error:
             raise LibraryError(
-                f"the pose prior {path} (with its card {path.with_suffix('.json').name}) cannot be "
+                f"the pose prior {path} (with its card {path.stem}.json) cannot be "
                 f"read: {error}; restore both files from the repository or the package"
             ) from error
 

@@ -134,6 +134,11 @@ def test_a_damaged_prior_is_named(damage: str, tmp_path: Path) -> None:
         PosePrior.load(path)
 
 
+def test_a_folder_is_no_prior() -> None:
+    with pytest.raises(LibraryError, match=r"the pose prior \. .*Is a directory"):
+        PosePrior.load(Path())
+
+
 def test_limits_that_refuse_everything_do_not_hang(prior: PosePrior) -> None:
     nobody = replace(prior, limits=replace(prior.limits, low=np.full_like(prior.limits.low, 1e9)))
     with pytest.raises(RuntimeError, match="refuse nearly every sample"):
