@@ -286,7 +286,9 @@ def test_inputs_that_cannot_be_used_are_named(
         build_library(tmp_path / "own", None, SETTINGS, mocap=Mocap((files[0], bad)))
     monkeypatch.setattr(recombine, "_ROUNDS", 2)
     impossible = replace(mocap.settings, limit_quantile=0.49)
-    with pytest.raises(LibraryError, match=r"cannot be recombined: .* --recombined 0"):
+    with pytest.raises(
+        LibraryError, match=r"^[0-9]+ poses cannot be recombined: .* --recombined 0"
+    ):
         build_library(tmp_path / "own", None, SETTINGS, mocap=replace(mocap, settings=impossible))
     with pytest.raises(ValueError, match="prior, from mocap or from both"):
         build_library(tmp_path / "own", None, SETTINGS)

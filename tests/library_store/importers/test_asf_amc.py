@@ -94,6 +94,7 @@ def test_the_index_names_the_action(clip_file: Path) -> None:
         ("ltibia", "lshin", "lshin"),
         ("rfemur ", "rfemur 1.0 ", "rfemur"),
         ("rfemur ", "rfemur x", "rfemur"),
+        ("lradius ", "lradius 1.0 ", "lradius 1.0 .*: 1 value expected"),
         ("lowerback ", "# lowerback ", "lowerback"),
     ],
 )

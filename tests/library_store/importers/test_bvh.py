@@ -94,6 +94,7 @@ def test_forward_kinematics_by_hand(tmp_path: Path) -> None:
     ("old", "new", "problem"),
     [
         ("Frames: 2", "Frames: 3", "27|18 values found"),
+        ("Frames: 2", "Frames: 1", "bad.bvh: 1 frame of 9 channels expected"),
         ("90 0 0 90 0 0", "90 0 0 90", "values found"),
         ("90 0 0 90 0 0", "90 0 0 x 0 0", "not a whole BVH"),
         ("MOTION", "", "HIERARCHY and MOTION"),
