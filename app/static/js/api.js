@@ -14,6 +14,9 @@ export class Refusal extends Error {
   }
 }
 
+/** Whoever asked waits no longer. */
+export class Stopped extends Error {}
+
 const MOST_TRIES = 4;
 
 /** `GET v1/info`, or null when it cannot be had (not ready yet, or a key is wanted). */

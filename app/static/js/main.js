@@ -1,6 +1,6 @@
 // The page: one photo at a time, its answer on two plates and in words. State lives here.
 
-import { Refusal, curlCommand, estimate, fetchInfo } from "./api.js";
+import { Refusal, Stopped, curlCommand, estimate, fetchInfo } from "./api.js";
 import { Panels } from "./panels.js";
 import { PhotoView } from "./photo.js";
 import { listenForPhotos } from "./sources.js";
@@ -29,6 +29,8 @@ for (const query of ["(prefers-color-scheme: dark)", "(min-width: 40rem)"]) {
   matchMedia(query).addEventListener("change", redraw);
 }
 addEventListener("resize", () => panels.redraw());
+$("stop").addEventListener("click", stop);
+addEventListener("keydown", (event) => event.key === "Escape" && !$("camera").open && stop());
 openStage();
 
 /**
@@ -43,7 +45,7 @@ async function open(source, name) {
   inFlight = null;
   state.photo = null; // until then there is nothing to ask about
   const turn = ++turns;
-  $("scan").hidden = true;
+  showWait(false);
   $("findings").inert = $("stage-frame").inert = true; // of another photo
   $("refusal").hidden = true;
   caption(`${name}: opening …`);
@@ -77,7 +79,7 @@ async function ask() {
   const { photo } = state;
   const { query, key } = options();
   $("refusal").hidden = true;
-  const scan = setTimeout(() => ($("scan").hidden = false), 250);
+  const scan = setTimeout(() => showWait(true), 250);
   caption(`${state.name}: asking …`);
   let answer;
   let { bitmap } = state;
@@ -92,16 +94,27 @@ async function ask() {
     if (bitmap && !state.isUpright) bitmap = await upright(bitmap, photo, answer.image).catch(() => bitmap);
   } catch (error) {
     const canBeRead = await isReadable(photo);
-    if (mine === inFlight && error.name !== "AbortError") refuse(error, canBeRead);
+    // Not every browser's fetch fails with the reason that it was aborted for.
+    const why = mine.signal.aborted ? mine.signal.reason : error;
+    if (mine === inFlight && why.name !== "AbortError") refuse(why, canBeRead);
     return;
   } finally {
     clearTimeout(scan);
-    if (mine === inFlight) $("scan").hidden = true;
+    if (mine === inFlight) showWait(false);
   }
   if (mine !== inFlight) return;
   if (bitmap !== state.bitmap) photoView.show(bitmap);
   Object.assign(state, { bitmap, isUpright: true });
   show(answer, query, key);
+}
+
+/** Wait no longer for the answer, if there is one to wait for; the service drops what it has not begun. */
+function stop() {
+  if (!$("stop").hidden) inFlight?.abort(new Stopped());
+}
+
+function showWait(isWaiting) {
+  $("scan").hidden = $("stop").hidden = !isWaiting;
 }
 
 /** A body over the limit is cut off by the server, which browsers report as a lost connection. */
@@ -163,6 +176,7 @@ function refuse(error, canBeRead = true) {
     $("refusal").append(again);
   }
   $("refusal").hidden = false;
+  if (error instanceof Stopped) $("refusal").lastChild.focus(); // the button that was pressed is gone
   if (error.status === 401) {
     $("options").open = true;
     $("form").elements.key.focus();

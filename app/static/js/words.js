@@ -1,6 +1,6 @@
 // Everything the page says about answers and refusals, in words.
 
-import { Refusal } from "./api.js";
+import { Refusal, Stopped } from "./api.js";
 import { spoken } from "./figure.js";
 
 const REFUSALS = {
@@ -26,6 +26,7 @@ const REFUSALS = {
  * @param {boolean} canBeRead whether the photo's file can
  */
 export function failureInWords(error, canBeRead) {
+  if (error instanceof Stopped) return { headline: "Stopped.", advice: "", detail: "", mayPass: true };
   if (!(error instanceof Refusal)) {
     const [headline, advice] = canBeRead
       ? ["The server cannot be reached.", "Is it still running?"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 
+import pytest
 from playwright.sync_api import Browser, Route, expect
 
 from tests.app.conftest import API_KEY, RENDERS
@@ -119,6 +120,30 @@ def test_a_lost_server_is_said_and_asked_again(browser: Browser, server: Server)
         again.click()
         answered(page)
         expect(refusal).to_be_hidden()
+
+
+@pytest.mark.parametrize("how", ["the button", "the keyboard"])
+def test_who_will_not_wait_stops_and_asks_again(browser: Browser, server: Server, how: str) -> None:
+    held: list[Route] = []
+    with Visit(browser, server) as page:
+        page.route("**/v1/poses?*", lambda route: held.append(route))
+        stop, refusal = page.locator("#stop"), page.locator("#refusal")
+        page.keyboard.press("Escape")  # nothing to be stopped yet
+        expect(refusal).to_be_hidden()
+        with page.expect_event("requestfailed"):
+            page.click("[data-sample='step.jpg']")
+            expect(stop).to_be_visible()
+            stop.click() if how == "the button" else page.keyboard.press("Escape")
+        expect(refusal).to_contain_text("Stopped")
+        expect(stop).to_be_hidden()
+        expect(page.locator("#photo")).to_be_visible()
+        again = refusal.locator("button")
+        expect(again).to_be_focused()
+        page.unroute("**/v1/poses?*")
+        page.keyboard.press("Enter")
+        answered(page)
+        expect(refusal).to_be_hidden()
+    assert len(held) == 1
 
 
 def test_what_is_of_the_last_photo_cannot_be_used(
