@@ -129,6 +129,6 @@ def test_the_shipped_networks_see_which_limb_is_nearer(name: str) -> None:
             assert found.depths_px is not None
             read.append(found.depths_px[names] / height)
             true.append(depths_px / height)
-    assert np.corrcoef(np.ravel(read), np.ravel(true))[0, 1] > 0.6
+    assert np.corrcoef(np.ravel(read), np.ravel(true))[0, 1] > 0.5, "of four people"
     apart = np.abs(np.subtract(read[0::2], read[1::2])).mean()
     assert apart < 0.5 * np.abs(true).mean()
