@@ -26,8 +26,13 @@ class Call:
 
 
 def headers(api_key: str | None) -> dict[str, str]:
-    """What every request of a client carries."""
+    """What every request of a client carries.
+
+    ``ValueError`` for a key that no header takes; the service's keys are ASCII.
+    """
     agent = {"User-Agent": f"posematch-client/{VERSION}"}
+    if api_key is not None and not api_key.isascii():
+        raise ValueError("api_key has characters other than ASCII, which no service's key has")
     return agent if api_key is None else {**agent, "Authorization": f"Bearer {api_key}"}
 
 

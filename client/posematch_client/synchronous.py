@@ -19,7 +19,7 @@ class Client:
 
     Args:
         url: where the service is, such as ``http://127.0.0.1:8000``.
-        api_key: when the service wants one.
+        api_key: when the service wants one, in ASCII; ``ValueError`` otherwise.
         retries: how patient to be with a busy or absent service.
         transport: another way to send requests (tests, proxies); see httpx.
 

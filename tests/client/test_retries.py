@@ -200,6 +200,12 @@ def test_senseless_patience() -> None:
     assert 408 not in RETRIED_STATUSES
 
 
+@pytest.mark.parametrize("kind", [Client, AsyncClient])
+def test_a_key_that_no_header_takes_is_refused_at_once(kind: type[Client | AsyncClient]) -> None:
+    with pytest.raises(ValueError, match="api_key has characters other than ASCII"):
+        kind("http://127.0.0.1:1", api_key="schlüssel-0123456789")
+
+
 @pytest.mark.parametrize("way", ["sync", "async"])
 def test_readiness_is_waited_for_until_the_deadline(way: str) -> None:
     """However many tries other calls have: a first start takes minutes."""
