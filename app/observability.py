@@ -190,10 +190,18 @@ class RequestContextMiddleware:
         try:
             await self._app(inner, receive, send_with_headers)
         finally:
-            route = state.get("route") or getattr(inner.get("route"), "path", "unmatched")
+            route = state.get("route") or _route_of(inner)
             record_request(
                 self._metrics, scope, route, status, time.perf_counter() - started_s, request_id
             )
+
+
+def _route_of(scope: Scope) -> str:
+    """The path that a request was matched with, as it is declared: few for any number of them."""
+    if "route" in scope:
+        return str(scope["route"].path)
+    # Starlette's own routes, such as the OpenAPI document's, do not tell: they have no parameters.
+    return str(scope["path"]) if "endpoint" in scope else "unmatched"
 
 
 class LastResortMiddleware:

@@ -65,6 +65,18 @@ def test_metrics(server: Server, photo: bytes) -> None:
     assert server.metric("posematch_people_per_image_count") >= 1
     text = server.client.get("/metrics").text
     assert "some/unknown" not in text, "clients cannot make labels"
+    assert 'route="unmatched"' in text
+
+
+def test_metrics_know_the_paths_that_the_framework_serves(server: Server) -> None:
+    sample = 'posematch_requests_total{method="GET",route="/openapi.json",status="200"}'
+    before = server.metric(sample)
+    server.client.get("/openapi.json")
+    assert server.metric(sample) == before + 1
+
+
+def test_metrics_name_the_library(server: Server) -> None:
+    text = server.client.get("/metrics").text
     assert 'library="small ' in text
 
 
