@@ -138,22 +138,36 @@ class Cluster:
         """What Ray says of the replicas, watched for the time of a ``with`` block."""
         return States(self._bin, self._address, log, self._environment)
 
+    def wait_for(self, replicas: int) -> None:
+        """Until so many replicas answer; says what is there when they do not."""
+        try:
+            wait_until(lambda: len(self.answering()) == replicas, f"{replicas} replicas answer")
+        except AssertionError as error:
+            raise AssertionError(
+                f"{error}; these answer: {self.answering()}, these run: {self.replicas()}; Ray"
+                f" says:\n{self._log.read_text()[-4000:]}"
+            ) from None
+
     def answering(self, asked: int = 12) -> dict[str, int]:
-        """Which replicas answer /metrics: when each started -> how many photos it has answered."""
+        """Which replicas answer /metrics: when each began -> how many photos it has answered.
+
+        By when it made its counters: processes that Ray starts together may share the start time
+        that the kernel states, in hundredths of a second.
+        """
         seen = {}
         for _ in range(asked):
             try:
                 text = httpx.get(f"{self.url}/metrics", timeout=30).text
             except httpx.TransportError:
                 continue
-            started = re.search(r"^process_start_time_seconds (\S+)", text, re.MULTILINE)
+            began = re.search(r"^posematch_abandoned_created (\S+)", text, re.MULTILINE)
             photos = re.search(
                 r'^posematch_requests_total{[^}]*route="/v1/poses",status="200"} (\S+)',
                 text,
                 re.MULTILINE,
             )
-            if started:
-                seen[started[1]] = int(float(photos[1])) if photos else 0
+            if began:
+                seen[began[1]] = int(float(photos[1])) if photos else 0
         return seen
 
     def __exit__(

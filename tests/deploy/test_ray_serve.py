@@ -53,7 +53,7 @@ def cluster(
     """Two replicas that refuse nothing for want of time, so that no failure is theirs."""
     with Cluster(ray_bin, tmp_path_factory.mktemp("ray") / "log") as running:
         running.deploy(replicas=REPLICAS, library_dir=library_dir, deadline_ms=60_000)
-        wait_until(lambda: len(running.answering()) == REPLICAS, "two replicas answer")
+        running.wait_for(REPLICAS)
         yield running
 
 
@@ -188,7 +188,7 @@ def test_replicas_come_and_go_with_the_load(cluster: Cluster, tmp_path: Path) ->
         with Load(ask, clients=1) as one:
             with Load(ask, clients=4) as four:
                 wait_until(lambda: states.are(2), "a second replica for five clients")
-                wait_until(lambda: len(cluster.answering()) == REPLICAS, "both answer")
+                cluster.wait_for(REPLICAS)
                 four.goes_on()
             wait_until(lambda: states.are(1), "one replica for the client that is left")
             one.goes_on()
