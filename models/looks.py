@@ -52,8 +52,8 @@ class Seen:
 
 
 FURTHER = (
-    Look(mirrored=True, zoom=1.0, below=0.52, share=0.58),
-    Look(mirrored=False, zoom=0.5**0.5, below=0.25, share=0.12),
+    Look(mirrored=True, zoom=1.0, below=0.46, share=0.41),
+    Look(mirrored=False, zoom=0.5**0.5, below=0.19, share=0.06),
 )
 """Who is spared a look would gain next to nothing by it (docs/experiments.md). The third sees the
 corners of a turned crop too."""
