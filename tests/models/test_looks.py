@@ -125,8 +125,8 @@ def test_who_is_seen_clearly_is_not_looked_at_again() -> None:
 
 
 def test_every_look_counts_the_same_and_is_taken_at_the_doubtful_only() -> None:
-    """Beliefs of 0.07, 0.36 and 0.88: looked at thrice, twice and once."""
-    heights = {3: -2.6, 2: -0.5, 1: 2.0}
+    """Beliefs of 0.04, 0.36 and 0.88: looked at thrice, twice and once."""
+    heights = {3: -3.0, 2: -0.5, 1: 2.0}
     first = np.concatenate([gaussians(leaning(0), top) for top in heights.values()])
     asked: list[int] = []
 
