@@ -73,12 +73,17 @@ def merge_libraries(
 
     All files of the parts are checked first. Restartable and atomic as a build. Raises
     ``LibraryError`` for a part that cannot be used, or that is given twice, and where ``directory``
-    holds anything but a library, ``ValueError`` for a name that ids cannot have.
+    is a part or holds anything but a library, ``ValueError`` for a name that ids cannot have.
     """
     if not NAME_PATTERN.fullmatch(name):
         raise ValueError(f"library name {name!r} must match {NAME_PATTERN.pattern}")
     report = progress or (lambda _stage, _fraction: None)
     directory = landing(directory)
+    if directory.resolve() in {part.resolve() for part in parts}:
+        raise LibraryError(
+            f"{directory} is one of the libraries to merge and would be replaced; "
+            "choose another directory"
+        )
     settings = index or IndexSettings()
     manifests = []
     for number, part in enumerate(parts):

@@ -157,6 +157,12 @@ def parse(path: Path) -> BvhFile:
         )
     if not 0.0 <= frame_time_s < math.inf:
         raise MocapError(path, f"a frame time of {frame_time_s:g} s is none")
+    if frame_time_s > 1.0:
+        raise MocapError(
+            path,
+            f"a frame time of {frame_time_s:g} s is too long; if it is frames a second, "
+            f"write {1 / frame_time_s:.6g}",
+        )
     return _without_idle_places(
         BvhFile(tuple(joints), values.reshape(n_frames, width), frame_time_s)
     )

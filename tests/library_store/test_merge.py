@@ -138,6 +138,14 @@ def test_parts_that_cannot_be_merged(folder: Path, tmp_path: Path) -> None:
         merge_libraries(tmp_path, [first, folder / "second"], name="both")
 
 
+def test_a_part_is_not_replaced_by_the_merged_library(folder: Path) -> None:
+    before = load(folder / "second").manifest
+    for directory in (folder / "second", folder / "first" / ".." / "second"):
+        with pytest.raises(LibraryError, match="one of the libraries to merge"):
+            merge_libraries(directory, [folder / "first", folder / "second"], name="both")
+    assert load(folder / "second").manifest == before
+
+
 def test_a_part_built_anew_meanwhile_is_not_merged(
     folder: Path, prior: PosePrior, tmp_path: Path
 ) -> None:

@@ -104,6 +104,7 @@ def test_forward_kinematics_by_hand(tmp_path: Path) -> None:
         ("CHANNELS 3", "CHANNELS 33333333333", "braces do not match"),
         ("0.04", "-0.04", "frame time"),
         ("0.04", "inf", "frame time"),
+        ("0.04", "120", "if it is frames a second, write 0.00833333"),
         ("0.04", "0,04", "float: '0,04'"),
         ("\n}\nMOTION", "\nMOTION", "the hierarchy does not end"),
         ("\nMOTION", "\n}\nMOTION", "braces do not match"),
